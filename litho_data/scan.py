@@ -1,7 +1,5 @@
 """One height map as an instrument recorded it, with everything that the file says about it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,6 +7,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
+from litho_data.foundation.kinds import YX, Array
 
 Axis = Literal["x", "y"]
 
@@ -35,13 +34,13 @@ class Scan:
             shape, or a pitch that is not positive.
     """
 
-    height_um: np.ndarray
-    pitch_um: tuple[float, float] | None
+    height_um: Array
+    pitch_um: YX | None
     name: str = ""
     channel: str = ""
     unit: str = "µm"
     fast_axis: Axis | None = None
-    mask: np.ndarray | None = None
+    mask: Array | None = None
     header: dict[str, str] = field(default_factory=dict)
     source: str = ""
     format: str = ""
@@ -49,7 +48,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         what = f"scan {self.source or self.name}".strip()
-        height = np.array(self.height_um, dtype=np.float64, order="C")
+        height = np.array(self.height_um, dtype=float, order="C")
         if height.ndim != 2 or min(height.shape) < 2:
             raise InputError(f"{what}: shape", got=height.shape, wanted="at least 2 x 2 pixels")
         height[~np.isfinite(height)] = np.nan
@@ -87,7 +86,7 @@ class Scan:
         """(ny, nx) in pixels."""
         return self.height_um.shape[0], self.height_um.shape[1]
 
-    def require_pitch(self) -> tuple[float, float]:
+    def require_pitch(self) -> YX:
         """The pitch (y, x) in µm, for every operation that needs lateral lengths.
 
         Raises:

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from litho_models.models import build_model as build_model
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
+    from litho_models.planning.rounds import close_loop as close_loop
     from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
     from litho_models.simulator import Simulator as Simulator
-    from litho_models.twin.run import close_loop as close_loop
 
     __version__: str
 else:
@@ -35,7 +35,7 @@ else:
             "analyse_noise": "litho_models.noise",
             "benchmark": "litho_models.evaluation.benchmark",
             "build_model": "litho_models.models",
-            "close_loop": "litho_models.twin.run",
+            "close_loop": "litho_models.planning.rounds",
             "compare": "litho_models.evaluation.compare",
             "evaluate": "litho_models.evaluation.evaluate",
             "freeze": "litho_models.frozen.freezing",

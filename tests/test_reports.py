@@ -128,16 +128,13 @@ def test_a_click_sorts_by_number_with_gaps_last_and_a_second_turns_it(browser, r
     assert orders == [["pbl", "fno", "own", "linear"], ["own", "fno", "pbl", "linear"]]
 
 
-def test_the_narrow_figure_is_drawn_anew(browser, reports):
-    """On the telephone two panels are side by side, the third below: the figure is no strip."""
-    sizes = {}
-    for width_px in (DESK_PX, PHONE_PX):
-        browser.show(reports["every part"], width_px, dark=False)
-        browser.run("document.querySelector('details').open = true")
-        shape = "(i => i.clientHeight / i.clientWidth)(document.querySelector('picture img'))"
-        sizes[width_px] = browser.run(shape)
-    assert sizes[DESK_PX] < 0.5
-    assert sizes[PHONE_PX] > 1
+def test_a_wide_figure_is_scrolled_on_a_telephone(browser, reports):
+    """Its letters stay as high as those of the page, and the page as wide as the screen."""
+    browser.show(reports["every part"], PHONE_PX, dark=False)
+    browser.run("document.querySelector('details').open = true")
+    width = browser.run("document.querySelector('.wide img').clientWidth")
+    assert width > 1.5 * PHONE_PX
+    assert browser.run("document.documentElement.scrollWidth") <= PHONE_PX
 
 
 def test_tables_have_names_for_people_and_the_csv_keeps_the_keys(reports):

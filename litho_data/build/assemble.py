@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from litho_data.build.jobs import Job
 from litho_data.build.operations import no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
+from litho_data.store.partial import outputs_of
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
 from litho_data.store.write import consolidate, write_samples, write_table
 
@@ -49,7 +49,7 @@ class Source:
 def assemble(
     root: zarr.Group,
     records: Sequence[Record],
-    load: Callable[[str], Mapping[str, np.ndarray]],
+    load: Callable[[str], Mapping[str, Array]],
     source: Source,
     skipped: Mapping[str, str],
     build: Record,
@@ -187,20 +187,19 @@ def table_sha256(table: pd.DataFrame) -> str:
 
 def _row(record: Record) -> dict[str, Any]:
     keys = ("id", "print", "order", "columns")
-    made = [output["name"] for step in record["steps"] for output in step["outputs"]]
+    made = [output["name"] for output in outputs_of(record)]
     return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level"), "arrays": made}
 
 
 def _identity(record: Record) -> dict[str, Any]:
-    hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
+    hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
     names = [*(variable.name for variable in SAMPLE_VARIABLES), "bend_um"]
     arrays = {name: hashes[name] for name in names if name in hashes}
     return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
 
 
 def _shape_of(record: Record, name: str) -> tuple[int, int]:
-    outputs = (output for step in record["steps"] for output in step["outputs"])
-    shape = next(output["shape"] for output in outputs if output["name"] == name)
+    shape = next(output["shape"] for output in outputs_of(record) if output["name"] == name)
     return int(shape[0]), int(shape[1])
 
 

@@ -1,7 +1,5 @@
 """``build_dataset``: raw files and a card in, a dataset store and a report out."""
 
-from __future__ import annotations
-
 import functools
 import os
 import shutil

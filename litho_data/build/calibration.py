@@ -1,7 +1,5 @@
 """The scales of a microscope from the card's scans of gratings and of a step."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +11,8 @@ import numpy as np
 
 from litho_data.cards.card import Grating
 from litho_data.cards.listing import Listing, leads_out, list_fields
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, about
+from litho_data.foundation.kinds import Array
 from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
@@ -98,7 +97,7 @@ def standards_of(listing: Listing) -> Standards:
     return Standards(tuple(standards), files)
 
 
-def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> np.ndarray:
+def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> Array:
     """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 of what has no standard.
 
     Raises:
@@ -110,22 +109,20 @@ def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]
 
 
 @lru_cache(maxsize=4)
-def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -> np.ndarray:
+def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -> Array:
     found = np.array([[1.0, 0.0]] * len(SCALES))
     waves, axes = [], []
     z = None
     for one in json.loads(standards):
         file, size = files[one["file"]], one["read"]["size_um"]
         scan = read_scan(file, **{**one["read"], "size_um": tuple(size) if size else None})
-        try:
-            if one["scale"] == "z":
-                z = one, scan
-            else:
-                wave = find_wave(scan.height_um, scan.require_pitch(), one["known_um"], one["scale"])
-                waves.append((wave, one["known_um"], one["uncertainty_um"]))
-                axes.append(one["scale"])
-        except InputError as error:
-            raise InputError(f"calibration scan {file.name}: {error}") from error
+        if one["scale"] == "z":
+            z = one, scan
+            continue
+        with about(f"calibration scan {file.name}"):
+            wave = find_wave(scan.height_um, scan.require_pitch(), one["known_um"], one["scale"])
+        waves.append((wave, one["known_um"], one["uncertainty_um"]))
+        axes.append(one["scale"])
     for axis, scale in (axis_scales(waves, axes) if waves else {}).items():
         found[SCALES.index(axis)] = scale.factor, scale.uncertainty
     if z is not None:
@@ -135,12 +132,9 @@ def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -
 
 def _z_scale(one: Mapping[str, Any], scan: Any, name: str) -> tuple[float, float]:
     pitch_y_um, pitch_x_um = scan.require_pitch()
-    try:
-        step = find_step(
-            scan.height_um, pitch_x_um if one["across"] == "x" else pitch_y_um, axis=one["across"]
-        )
-    except InputError as error:
-        raise InputError(f"calibration scan {name}: {error}") from error
+    pitch_um = pitch_x_um if one["across"] == "x" else pitch_y_um
+    with about(f"calibration scan {name}"):
+        step = find_step(scan.height_um, pitch_um, axis=one["across"])
     factor = 1e3 * one["known_um"] / step.height_nm
     if not 1 / _MOST_Z < factor < _MOST_Z:
         raise InputError(

@@ -1,12 +1,8 @@
 """The tip behind all scans of a card, found before they are built."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from litho_data.build.jobs import FieldJob, scaled_pitch_um
 from litho_data.foundation.errors import InputError
@@ -46,5 +42,5 @@ def tip_of(job: FieldJob) -> PeakRadius | None:
         return None
     scales = {} if calibrated is None else calibrated.facts
     pitch_y_um, pitch_x_um = scaled_pitch_um(read.facts["pitch_um"], scales)
-    height_um = read.arrays["raw_height_um"].astype(np.float64) * scales.get("scale_z", 1.0)
+    height_um = read.arrays["raw_height_um"].astype(float) * scales.get("scale_z", 1.0)
     return peak_radius(height_um, (pitch_y_um, pitch_x_um))

@@ -1,13 +1,10 @@
 """What scans of a grating of known size say about the microscope: its scales, its unevenness, its tip."""
 
-from __future__ import annotations
-
 from typing import Any
-
-import numpy as np
 
 from litho_data.cards.card import KnownGrating
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
 from litho_data.roughness import axis_scales, find_wave, line_bow
 from litho_data.store.read import Store
@@ -55,11 +52,9 @@ def grating_scans(store: Store) -> list[GratingScan]:
     ]
 
 
-def grating_scan(
-    scan_id: str, height_um: np.ndarray, pitch_um: tuple[float, float], known: KnownGrating
-) -> GratingScan:
+def grating_scan(scan_id: str, height_um: Array, pitch_um: YX, known: KnownGrating) -> GratingScan:
     """One scan, heights (ny, nx) in µm of a stated (y, x) pitch."""
-    height_um = height_um.astype(np.float64)
+    height_um = height_um.astype(float)
     found = GratingScan(id=scan_id, period_um=known.period_um, line_um=height_um.shape[1] * pitch_um[1])
     tip = peak_radius(height_um, pitch_um)
     figures: dict[str, Any] = {}

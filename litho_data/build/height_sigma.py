@@ -1,11 +1,10 @@
 """The standard uncertainty of every registered height, and what it is made of."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array
 from litho_data.register.resample import line_variance_factor, noise_variance_factor, transfer_error
 from litho_data.register.topography import fill_gaps
 from litho_data.register.warp_error import warp_error
@@ -14,18 +13,18 @@ from litho_data.scan import Axis
 
 
 def height_sigma(
-    levelled_um: np.ndarray,
-    height_um: np.ndarray,
-    layout_level: np.ndarray,
+    levelled_um: Array,
+    height_um: Array,
+    layout_level: Array,
     *,
-    scan_pitch_um: tuple[float, float],
+    scan_pitch_um: YX,
     layout_pitch_um: float,
     blur_px: float,
     model: str,
     levelled: bool,
     fast_axis: Axis = "x",
     z_uncertainty: float = 0.0,
-) -> tuple[np.ndarray, Mapping[str, float]]:
+) -> tuple[Array, Mapping[str, float]]:
     """The standard uncertainty of registered heights, the offset of the scan aside.
 
     The variance is a sum of six parts: white noise of pixels and of lines as far as the resampling leaves
@@ -46,8 +45,8 @@ def height_sigma(
         float32 µm on the layout's grid, NaN where not valid; and per part the root mean square, as
         ``sigma_<part>_nm``, and that of all as ``sigma_nm``.
     """
-    own, height = levelled_um.astype(np.float64), height_um.astype(np.float64)
-    valid, shape = np.isfinite(height), (height.shape[0], height.shape[1])
+    own, height = levelled_um.astype(float), height_um.astype(float)
+    valid, shape = np.isfinite(height), height.shape
     pixel_nm, line_nm = white_noise(own, fast_axis=fast_axis)
     slow_pitch_um = scan_pitch_um[0 if fast_axis == "x" else 1]
     fit = warp_error(height, layout_level, blur_px, model)
@@ -70,8 +69,8 @@ def height_sigma(
 
 
 def _resampling_nm2(
-    levelled_um: np.ndarray,
-    scan_pitch_um: tuple[float, float],
+    levelled_um: Array,
+    scan_pitch_um: YX,
     layout_pitch_um: float,
     pixel_nm: float,
     line_nm: float,

@@ -3,14 +3,10 @@
 Jobs travel to other processes and machines, so they hold paths and plain parameters only.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
-
-import numpy as np
 
 from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.build.operations import OPERATIONS
@@ -20,6 +16,7 @@ from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
@@ -61,6 +58,10 @@ def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
     return piece.record
 
 
+# A field that is alone on the substrate gets a rim of level 0: models go on as a layout ends.
+_BARE_PX = 2
+
+
 @dataclass(frozen=True)
 class FieldJob:
     """Read, level, register and resample one printed field.
@@ -100,7 +101,7 @@ class FieldJob:
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
         return record_sha256([*plan, files, code])
 
-    def layout(self) -> np.ndarray | None:
+    def layout(self) -> Array | None:
         """Levels of its layout; None if there is none that can be read."""
         try:
             done = self._read_layout()
@@ -156,51 +157,44 @@ class FieldJob:
         return Piece(json.loads(json.dumps(record)), arrays)
 
     def _steps(self) -> Iterator[Done]:
-        """The operations in order; each sees the arrays of those before it."""
-        layout: dict[str, np.ndarray] = {}
-        if (done := self._read_layout()) is not None:
-            layout = done.arrays
-            yield done
-        read = self.read()
+        """The operations in order; each takes what it needs of the arrays of those before it."""
+        held: dict[str, Array] = {}
+
+        def kept(done: Done) -> Done:
+            held.update(done.arrays)
+            return done
+
+        def made(op: str, params: Mapping[str, Any]) -> Done:
+            return kept(OPERATIONS[op].run(params, {}, held))
+
+        if (layout := self._read_layout()) is not None:
+            yield kept(layout)
+        read = kept(self.read())
         yield read
-        calibration: dict[str, np.ndarray] = {}
         pitch_um = read.facts["pitch_um"]
-        if (done := self.calibrate()) is not None:
-            yield done
-            calibration = done.arrays
-            pitch_um = scaled_pitch_um(pitch_um, done.facts)
+        if (scales := self.calibrate()) is not None:
+            yield kept(scales)
+            pitch_um = scaled_pitch_um(pitch_um, scales.facts)
         pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
         register_params = self.register_params(pitch_um, read.facts["fast_axis"])
-
-        level_inputs, recipe = {**read.arrays, **calibration}, dict(self.recipe)
-        if not layout:
+        recipe = dict(self.recipe)
+        if layout is None:
             # A reference has none.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
-            raw = {"raw_height_um": read.arrays["raw_height_um"]}
-            located = OPERATIONS["locate"].run(register_params, {}, {**layout, **raw})
-            level_inputs |= located.arrays
-            yield located
-        levelled = OPERATIONS["level"].run({**pitch, "recipe": recipe}, {}, level_inputs)
-        yield levelled
+            yield made("locate", register_params)
+        yield made("level", {**pitch, "recipe": recipe})
         if self.field.use != "dataset":
             return
-        height = {"levelled_height_um": levelled.arrays["levelled_height_um"]}
-        registered = OPERATIONS["register"].run(register_params, {}, {**layout, **height})
+        registered = made("register", register_params)
         yield registered
-        found = dict(registered.arrays)
         if self.card.process.tip is not None:
-            touched = OPERATIONS["tip"].run({**pitch, "radius_um": self.card.process.tip}, {}, height)
-            found |= touched.arrays
-            yield touched
-        shape = {"layout_shape": list(layout["mask_level"].shape)}
-        resampled = OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **found})
-        yield resampled
+            yield made("tip", {**pitch, "radius_um": self.card.process.tip})
+        yield made("resample", {**pitches, "layout_shape": list(held["mask_level"].shape)})
         fit = {name: registered.facts[name] for name in ("blur_um", "model")}
-        at = {**height, "height_um": resampled.arrays["height_um"], **layout, **calibration}
         lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(recipe["step"])}
-        yield OPERATIONS["uncertainty"].run({**pitches, **fit, **lines}, {}, at)
+        yield made("uncertainty", {**pitches, **fit, **lines})
 
     def _read_layout(self) -> Done | None:
         """The layout as it was read, None if the field has none; InputError if that fails."""
@@ -210,6 +204,10 @@ class FieldJob:
         params: dict[str, Any] = {"levels": self.card.layout.levels}
         if self.card.layout.grey_per_level is not None:
             params["grey_per_level"] = self.card.layout.grey_per_level
+        write = self.card.write
+        surround = self.field.columns.get("surround") or (write.surround if write else None)
+        if surround == "substrate":
+            params["bare_px"] = _BARE_PX
         return OPERATIONS["read-layout"].run(params, file, {})
 
     @property

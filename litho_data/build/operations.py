@@ -14,6 +14,7 @@ import numpy as np
 
 from litho_data.build.step import Facts, Files, Function, Inputs, Made, Operation, Params
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
@@ -27,11 +28,13 @@ _OBLONG = 0.01
 OPERATIONS: dict[str, Operation] = {}
 
 
-def _operation(name: str, *code: str) -> Callable[[Function], Function]:
+def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
     """Make a function the operation of that name; its result depends on ``code`` and this file."""
 
     def made(function: Function) -> Function:
-        OPERATIONS[name] = Operation(name, "1", function, (*code, "build/operations.py"))
+        OPERATIONS[name] = Operation(
+            name, "1", function, tuple(takes.split()), (*code, "build/operations.py")
+        )
         return function
 
     return made
@@ -51,7 +54,7 @@ def no_recipe() -> dict[str, Any]:
     return Recipe().canonical()
 
 
-@_operation("read-layout", "readers")
+@_operation("read-layout", "", "readers")
 def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_layout
 
@@ -59,10 +62,10 @@ def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     if level.max() >= params["levels"]:
         wanted = f"at most {params['levels'] - 1}, since the card says levels = {params['levels']}"
         raise InputError(f"layout {files[0]}: highest level", got=int(level.max()), wanted=wanted)
-    return {"mask_level": level}, {}
+    return {"mask_level": np.pad(level, params.get("bare_px", 0))}, {}
 
 
-@_operation("read-scan", "readers", "scan.py", "foundation/units.py")
+@_operation("read-scan", "", "readers", "scan.py", "foundation/units.py")
 def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_scan
 
@@ -83,7 +86,7 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     return arrays, facts
 
 
-@_operation("calibrate", "readers", "roughness", "build/calibration.py")
+@_operation("calibrate", "", "readers", "roughness", "build/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     """Scales of the microscope, from scans of what has a known size."""
     from litho_data.build.calibration import SCALES, measure_scales
@@ -95,7 +98,7 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     return {"calibration": found}, facts
 
 
-def _z_scale(arrays: Mapping[str, np.ndarray]) -> tuple[float, float]:
+def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
     """Factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
     if "calibration" not in arrays:
         return 1.0, 0.0
@@ -103,7 +106,7 @@ def _z_scale(arrays: Mapping[str, np.ndarray]) -> tuple[float, float]:
     return factor, uncertainty / factor
 
 
-@_operation("locate", "register", "level")
+@_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     """Where the layout lies in the scan before levelling, for layout-aware levelling."""
     from litho_data.level import layout_in_scan_frame
@@ -111,19 +114,19 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
     found = _registration(raw, layout, params)
     _require_found(found, params, " before levelling")
-    shape, pitch_um = (raw.shape[0], raw.shape[1]), tuple(params["scan_pitch_um"])
+    shape, pitch_um = raw.shape, tuple(params["scan_pitch_um"])
     level = layout_in_scan_frame(
         layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"], found.bend_um
     )
     return {"layout_in_scan": level.astype(np.float32)}, {}
 
 
-@_operation("level", "level")
+@_operation("level", "raw_height_um vendor_mask calibration layout_in_scan", "level")
 def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.level import Recipe
 
     levelled, notes = Recipe.from_dict(params["recipe"]).apply_noting(
-        arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
+        arrays["raw_height_um"].astype(float) * _z_scale(arrays)[0],
         pitch_um=tuple(params["scan_pitch_um"]),
         mask=arrays.get("vendor_mask"),
         layout_level=arrays.get("layout_in_scan"),
@@ -134,7 +137,7 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     } if notes else {}
 
 
-@_operation("register", "register")
+@_operation("register", "mask_level levelled_height_um", "register")
 def _register(params: Params, _: Files, arrays: Inputs) -> Made:
     found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
     _require_found(found, params)
@@ -155,11 +158,11 @@ def _require_found(found: Registration, params: Params, when: str = "") -> None:
         raise InputError(f"{UNREGISTERED}{when}: {found.quality.reason}", hint=pixels if oblong else "")
 
 
-def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mapping[str, Any]) -> Registration:
+def _registration(height_um: Array, layout_level: Array, params: Mapping[str, Any]) -> Registration:
     from litho_data.register import register_scan
 
     return register_scan(
-        height_um.astype(np.float64),
+        height_um.astype(float),
         layout_level,
         scan_pitch_um=tuple(params["scan_pitch_um"]),
         layout_pitch_um=params["layout_pitch_um"],
@@ -169,11 +172,11 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
     )
 
 
-@_operation("tip", "tip", "register/topography.py")
+@_operation("tip", "levelled_height_um", "tip", "register/topography.py")
 def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.tip import lateral_resolution_um, tip_certain
 
-    height, pitch_um = arrays["levelled_height_um"].astype(np.float64), tuple(params["scan_pitch_um"])
+    height, pitch_um = arrays["levelled_height_um"].astype(float), tuple(params["scan_pitch_um"])
     radius_um = params["radius_um"]
     certain = tip_certain(height, pitch_um, radius_um)
     facts = {
@@ -184,16 +187,16 @@ def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"tip_certain": certain}, facts
 
 
-@_operation("resample", "register")
+@_operation("resample", "levelled_height_um scan_to_layout bend_um defect tip_certain", "register")
 def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.register import Bend, resample_to_layout
 
     levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
     bend = Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if "bend_um" in arrays else None
 
-    def on_layout(scan_map: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def on_layout(scan_map: Array) -> tuple[Array, Array]:
         return resample_to_layout(
-            scan_map.astype(np.float64),
+            scan_map.astype(float),
             arrays["scan_to_layout"],
             tuple(params["layout_shape"]),
             scan_pitch_um=pitch_um,
@@ -209,7 +212,13 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 
-@_operation("uncertainty", "register", "roughness", "build/height_sigma.py")
+@_operation(
+    "uncertainty",
+    "levelled_height_um height_um mask_level calibration",
+    "register",
+    "roughness",
+    "build/height_sigma.py",
+)
 def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.build.height_sigma import height_sigma
 
@@ -228,7 +237,7 @@ def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"height_sigma_um": sigma_um}, dict(budget)
 
 
-@_operation("stitch-pairs", "readers")
+@_operation("stitch-pairs", "", "readers")
 def _stitch_pairs(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers.pairs import stitch_field
 

@@ -3,15 +3,15 @@
 All contain topography, so as estimates of instrument noise they are upper bounds.
 """
 
-from __future__ import annotations
-
 import numpy as np
+
+from litho_data.foundation.kinds import Array
 
 # The median absolute deviation of a Gaussian is 0.6745 sigma.
 _MAD_PER_SIGMA = 0.674489750196
 
 
-def noise_figures(height_um: np.ndarray) -> dict[str, float]:
+def noise_figures(height_um: Array) -> dict[str, float]:
     """Noise and line errors of a scan, (ny, nx) µm with NaN where not measured, in nm.
 
     ``noise_x_nm``, ``noise_y_nm``: second difference z[i-1] - 2 z[i] + z[i+1] along the axis, median absolute
@@ -19,7 +19,7 @@ def noise_figures(height_um: np.ndarray) -> dict[str, float]:
     ``row_step_nm``: standard deviation of the steps between the medians of neighbouring rows;
     ``column_step_nm``: the same for columns, as a control.
     """
-    height_nm = np.asarray(height_um, dtype=np.float64) * 1e3
+    height_nm = np.asarray(height_um, dtype=float) * 1e3
     return {
         "noise_x_nm": _second_difference_sigma(height_nm),
         "noise_y_nm": _second_difference_sigma(height_nm.T),
@@ -29,16 +29,16 @@ def noise_figures(height_um: np.ndarray) -> dict[str, float]:
     }
 
 
-def levelling_figures(removed_um: np.ndarray) -> dict[str, float]:
+def levelling_figures(removed_um: Array) -> dict[str, float]:
     """Peak-to-valley and standard deviation of the surface that levelling removed, nm."""
-    removed_nm = np.asarray(removed_um, dtype=np.float64) * 1e3
+    removed_nm = np.asarray(removed_um, dtype=float) * 1e3
     return {
         "removed_range_nm": float(np.nanmax(removed_nm) - np.nanmin(removed_nm)),
         "removed_sd_nm": float(np.nanstd(removed_nm)),
     }
 
 
-def _second_difference_sigma(height: np.ndarray) -> float:
+def _second_difference_sigma(height: Array) -> float:
     difference = height[:, :-2] - 2 * height[:, 1:-1] + height[:, 2:]
     measured = difference[np.isfinite(difference)]
     if measured.size == 0:
@@ -47,7 +47,7 @@ def _second_difference_sigma(height: np.ndarray) -> float:
     return float(spread / np.sqrt(6))
 
 
-def _line_step_sd(height: np.ndarray) -> float:
+def _line_step_sd(height: Array) -> float:
     lines = height[np.isfinite(height).any(axis=1)]
     if len(lines) < 2:
         return float("nan")

@@ -11,8 +11,9 @@ import numpy as np
 from litho_data.build.gratings import GratingScan, grating_scans
 from litho_data.build.verdict import verdict_of
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
+from litho_data.foundation.report_pictures import colour_bar_png, coloured_png, thumbnail
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from litho_data.build.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
-_THUMBNAIL_PX = 180
 # Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
 _BLUR_PX = 3.0
 _STAGES = {
@@ -128,19 +128,16 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
 
 
 def _left_out(page: Page, result: BuildResult) -> None:
-    import pandas as pd
-
     if result.findings:
         page.heading("To do")
-        table = pd.DataFrame([(one.scan, one.text) for one in result.findings], columns=["scan", "what"])
+        table = [{"scan": one.scan, "what": one.text} for one in result.findings]
         page.table(table, "What speaks against the dataset, worst first", "findings.csv")
-    rows = [(one.id, "skipped", one.reason) for one in result.skipped]
-    rows += [(one.id, "unpaired", one.reason) for one in result.unpaired]
+    apart = {"skipped": result.skipped, "unpaired": result.unpaired}
+    rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
     if rows:
         page.heading("Not in the store")
-        table = pd.DataFrame(rows, columns=["id", "status", "reason"])
         caption = "Ids that are not in the store, and why; `--strict` refuses to build without them"
-        page.table(table, caption, "left_out.csv")
+        page.table(rows, caption, "left_out.csv")
 
 
 def _warnings(page: Page, quality: pd.DataFrame) -> None:
@@ -167,12 +164,10 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
 
 
 def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
-    import pandas as pd
-
     if scans:
         page.heading("What the grating says about the microscope")
         page.table(
-            pd.DataFrame([{name: getattr(one, name) for name in _GRATING} for one in scans]),
+            [{name: getattr(one, name) for name in _GRATING} for one in scans],
             "Scales, unevenness of a line and tip, from the known period of the grating; no other scan is "
             "corrected by them",
             "gratings.csv",
@@ -206,31 +201,26 @@ def _shown_ids(store: Store) -> list[str]:
     return [str(scan_id) for scan_id in worst]
 
 
-def _stages(store: Store, scan_id: str) -> list[np.ndarray]:
+def _stages(store: Store, scan_id: str) -> list[Array]:
     """Thumbnails of a scan, in the order of ``_STAGES``."""
     scan = store.scan(scan_id)
     raw = store.scan_frame(scan_id, "raw_height_um")
     images = [scan.mask_level, raw * 1e3, scan.height_um * 1e3, _residual_nm(scan)]
-    return [_thumbnail(image) for image in images]
+    return [thumbnail(image) for image in images]
 
 
-def _residual_nm(scan: PrintedScan) -> np.ndarray:
+def _residual_nm(scan: PrintedScan) -> Array:
     from litho_data.register import predicted_topography
 
     layout = predicted_topography(scan.mask_level, _BLUR_PX)
-    x, z = layout[scan.valid].astype(np.float64), scan.height_um[scan.valid].astype(np.float64)
+    x, z = layout[scan.valid].astype(float), scan.height_um[scan.valid].astype(float)
     x_mean, z_mean = (float(values.mean()) if values.size else 0.0 for values in (x, z))
     variance = float(((x - x_mean) ** 2).sum())
     gain = float(((x - x_mean) * (z - z_mean)).sum()) / variance if variance > 0 else 0.0
     return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
 
 
-def _range(images: Sequence[np.ndarray], symmetric: bool) -> tuple[float, float]:
+def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
     values = np.concatenate([image.ravel() for image in images])
     low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
     return (-max(-low, high), max(-low, high)) if symmetric else (low, high)
-
-
-def _thumbnail(image: np.ndarray) -> np.ndarray:
-    step = max(1, -(-max(image.shape) // _THUMBNAIL_PX))
-    return image[::step, ::step]

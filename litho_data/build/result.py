@@ -1,7 +1,5 @@
 """``build.json``: what a build made and what it left out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, ClassVar
 

@@ -4,8 +4,6 @@ A scan that registers may still show another layout like its own, a mirrored one
 another dose. One that does not register may show another layout of the set.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array
 from litho_data.register.geometry import ORIENTATIONS
 from litho_data.register.orientation import search_orientation
 from litho_data.register.scan import at_layout_pitch
@@ -42,8 +41,8 @@ class Print:
     """
 
     id: str
-    topography: np.ndarray
-    height: np.ndarray
+    topography: Array
+    height: Array
     response: tuple[float, float]
     highest_level: int
     layout: str
@@ -53,7 +52,7 @@ class Print:
 
 
 def prints_of(
-    records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, np.ndarray]]
+    records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, Array]]
 ) -> list[Print]:
     """The registered scans among these, at a few points.
 
@@ -73,9 +72,9 @@ def doubts(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def fitting_layout(
-    height_um: np.ndarray,
-    scan_pitch_um: tuple[float, float],
-    layouts: Mapping[str, np.ndarray],
+    height_um: Array,
+    scan_pitch_um: YX,
+    layouts: Mapping[str, Array],
     pitch_um: float,
 ) -> str:
     """The layout whose topography a scan shows, in any orientation, or "" if none stands out.
@@ -98,7 +97,7 @@ def fitting_layout(
     return ranked[0] if scores[ranked[0]] - rival > _LEAD else ""
 
 
-def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Print:
+def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     level = arrays["mask_level"]
     step = max(1, -(-max(level.shape) // _SIDE_PX))
     sparse = (slice(step // 2, None, step),) * 2
@@ -138,7 +137,7 @@ def _other_layouts(prints: Sequence[Print]) -> list[tuple[str, str]]:
     return said
 
 
-def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator[np.ndarray]:
+def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator[Array]:
     """Per scan its correlation with each layout, within ``_ROUNDING``: sums over pairs as matrix products."""
     of_layouts = np.stack([one.topography.ravel() for one in layouts]).astype(np.float32)
     of_layouts -= of_layouts.mean(axis=1, keepdims=True)
@@ -158,7 +157,7 @@ def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator
 def _correlation(one: Print, other: Print) -> float:
     """Of the heights of one scan with the layout of another."""
     seen = np.isfinite(one.height)
-    return pearson(one.height[seen].astype(np.float64), other.topography[seen])
+    return pearson(one.height[seen].astype(float), other.topography[seen])
 
 
 def _orientations(prints: Sequence[Print]) -> list[tuple[str, str]]:
@@ -215,7 +214,7 @@ def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
     return said + [(one.id, traded[one.group]) for one in prints if one.group in traded]
 
 
-def _response(topography: np.ndarray, height: np.ndarray) -> tuple[float, float]:
+def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Height per level, µm: the slope of the heights over the blurred layout; and how it grows with the dose.
 
     Level times dose is the exposure, so that the curve of the heights over the levels tells what a larger
@@ -224,7 +223,7 @@ def _response(topography: np.ndarray, height: np.ndarray) -> tuple[float, float]
     saturated print it is negative.
     """
     seen = np.isfinite(height)
-    level, height = topography[seen].astype(np.float64), height[seen].astype(np.float64)
+    level, height = topography[seen].astype(float), height[seen].astype(float)
     from_mean = level - level.mean()
     slope = float((from_mean * height).sum())
     square = float(np.polyfit(level, height, 2)[0]) * float((from_mean * level**2).sum())
@@ -246,7 +245,7 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     error = scatter / np.sqrt([rising[dose][1] for dose in doses])
     clear = _CLEAR_SIGMA * np.hypot.outer(error, error)
 
-    def falls(order: np.ndarray) -> bool:
+    def falls(order: Array) -> bool:
         return bool((np.triu(order[:, None] - order[None, :] - clear, 1) > 0).any())
 
     count = len(doses)

@@ -9,19 +9,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, file_sha256, record_sha256, source_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.store.schema import VARIABLES
 
 PACKAGE = Path(__file__).parents[1]
-Arrays = dict[str, np.ndarray]
+Arrays = dict[str, Array]
 Facts = dict[str, Any]
 # An operation: (parameters, raw files, input arrays by name) to arrays and facts.
 Params = Mapping[str, Any]
 Files = Sequence[Path]
-Inputs = Mapping[str, np.ndarray]
+Inputs = Mapping[str, Array]
 Made = tuple[Arrays, Facts]
 Function = Callable[[Params, Files, Inputs], Made]
 
@@ -76,12 +75,15 @@ class Operation:
         name: as in the records.
         version: changed whenever the function may give other results.
         function: ``function(params, files, arrays) -> (arrays, facts)``.
+        takes: names of the arrays, in the order in which they are recorded; those that a scan lacks are
+            left out.
         code: files and folders of this package that the result depends on.
     """
 
     name: str
     version: str
     function: Function
+    takes: tuple[str, ...]
     code: tuple[str, ...]
 
     @property
@@ -89,19 +91,18 @@ class Operation:
         """Hash of the source that the result depends on."""
         return _code_sha256(self.code)
 
-    def run(
-        self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, np.ndarray]
-    ) -> Done:
+    def run(self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]) -> Done:
         """Run the operation and record it.
 
         Args:
             params: explicit parameters, plain data.
             files: raw files by their recorded name, in the order that the operation expects.
-            arrays: input arrays by their name in the store.
+            arrays: by their name in the store; those that the operation takes are its inputs.
 
         Raises:
             InputError: anything wrong with the input, including a missing or unreadable file.
         """
+        arrays = {name: arrays[name] for name in self.takes if name in arrays}
         try:
             inputs = [{"name": name, "sha256": file_sha256(path)} for name, path in files.items()]
             inputs += [
@@ -138,7 +139,7 @@ def _one_thread() -> Iterator[None]:
         cv2.setNumThreads(threads)
 
 
-def _described(name: str, array: np.ndarray) -> dict[str, Any]:
+def _described(name: str, array: Array) -> dict[str, Any]:
     variable = VARIABLES[name]
     dims, unit = variable.sample_dims, variable.unit
     sha256 = array_sha256(array, unit, dims)

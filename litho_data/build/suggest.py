@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +17,7 @@ from litho_data.build.operations import OPERATIONS, load_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.level.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def suggest_recipe(
     places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
     warned: dict[str, str] = {}
-    pictures: dict[str, list[np.ndarray]] = {}
+    pictures: dict[str, list[Array]] = {}
     refusal = ""
     for job in (jobs[place] for place in places):
         if len(pictures) == _SCANS:
@@ -134,7 +135,7 @@ def _best(left_nm: Mapping[str, float]) -> str:
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
-def _located(job: FieldJob) -> tuple[np.ndarray, np.ndarray, Sequence[float]]:
+def _located(job: FieldJob) -> tuple[Array, Array, Sequence[float]]:
     """Raw heights (ny, nx) µm, the layout in the scan's frame, NaN outside it, and the pitch (y, x)."""
     read, layout, calibrated = job.read(), job.layout(), job.calibrate()
     if layout is None:
@@ -143,12 +144,10 @@ def _located(job: FieldJob) -> tuple[np.ndarray, np.ndarray, Sequence[float]]:
     raw = read.arrays["raw_height_um"]
     params = job.register_params(pitch_um, read.facts["fast_axis"])
     found = OPERATIONS["locate"].run(params, {}, {"mask_level": layout, "raw_height_um": raw})
-    return raw.astype(np.float64), found.arrays["layout_in_scan"], pitch_um
+    return raw.astype(float), found.arrays["layout_in_scan"], pitch_um
 
 
-def _levelled(
-    recipe: str, raw_um: np.ndarray, layout: np.ndarray, pitch_um: Sequence[float]
-) -> tuple[np.ndarray, str]:
+def _levelled(recipe: str, raw_um: Array, layout: Array, pitch_um: Sequence[float]) -> tuple[Array, str]:
     """The heights, and what speaks against the recipe; one that cannot be applied leaves them as they are."""
     pitch = (float(pitch_um[0]), float(pitch_um[1]))
     try:
@@ -159,7 +158,7 @@ def _levelled(
     return levelled.height, "; ".join(notes)
 
 
-def left_by_layout(height_um: np.ndarray, layout: np.ndarray) -> float:
+def left_by_layout(height_um: Array, layout: Array) -> float:
     """Root mean square of what a free response to the layout leaves in blocks outside its fit, µm.
 
     Args:
@@ -193,36 +192,33 @@ def _write_card(card: Path, best: str) -> Path:
     return target
 
 
-def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[np.ndarray]], folder: Path) -> None:
-    import pandas as pd
-
+def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:
     from litho_data.foundation.report import Page
 
     page = Page(
         "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
     )
     page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
-    rows: list[dict[str, Any]] = [
+    rows = [
         {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
     ]
     caption = (
         "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
     )
-    page.table(pd.DataFrame(rows), caption, "recipes.csv", digits=1)
+    page.table(rows, caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)
 
 
-def _show(page: Page, pictures: Mapping[str, Sequence[np.ndarray]]) -> None:
-    from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
+def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
+    from litho_data.foundation.report_pictures import colour_bar_png, coloured_png, thumbnail
 
     rows, bar = [], colour_bar_png("cividis")
     for name, images in pictures.items():
         shown = []
         for image in images:
-            step = max(1, -(-max(image.shape) // 180))
             low, high = (float(one) for one in np.nanpercentile(image, [0.5, 99.5]))
-            shown.append(coloured_png(image[::step, ::step], "cividis", low, high))
+            shown.append(coloured_png(thumbnail(image), "cividis", low, high))
         rows.append((name, shown))
     columns = [(title, bar) for title in ("raw", *RECIPES)]
     page.gallery(columns, rows, "Heights before and after each recipe, every picture on a scale of its own.")

@@ -1,8 +1,6 @@
 """Is a dataset good, and if not what is to be done: every number of the card against the heights."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -22,6 +20,7 @@ _LEAST_VALID = 0.5
 _MOST_TRE_PX = 1.0
 # What levelling left, as a share of the print's own standard deviation.
 _LEFT = 0.3
+_SHOWN = 12
 
 
 class Weight(IntEnum):
@@ -94,62 +93,65 @@ def findings(
         skipped: why a scan is not in the store, by id.
         card: whose numbers are compared with the heights.
     """
-    found = [Finding(scan=name, text=text, weight=Weight.LAYOUT) for name, text in doubts.items()]
-    found += [
-        Finding(scan=name, text=f"skipped: {reason}", weight=Weight.SKIPPED)
-        for name, reason in skipped.items()
-    ]
-    found += _of_the_card(records, prints, card)
+    named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
+    named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
     spread_nm = {one.id: 1e3 * float(np.nanstd(one.height)) for one in prints}
     for record in records:
-        name, quality = record["id"], record["quality"]
-        found += [Finding(scan=name, text=note, weight=Weight.NOTE) for note in record.get("notes", ())]
-        if quality.get("polarity") == -1:
-            text = "its heights fall where the levels rise: is the layout or the scan inverted?"
-            found.append(Finding(scan=name, text=text, weight=Weight.LAYOUT))
-        if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
-            text = f"details lie {off:.1f} px from their place: is it the right layout and pitch?"
-            found.append(Finding(scan=name, text=text, weight=Weight.PLACE))
-        if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
-            text = f"only {valid:.0%} of its layout has a height: is process.tip too large?"
-            found.append(Finding(scan=name, text=text, weight=Weight.PLACE))
-        left = quality.get("sigma_levelling_nm", 0.0)
-        if left > _LEFT * spread_nm.get(name, np.inf):
-            text = (
-                f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
-            )
-            found.append(Finding(scan=name, text=text, weight=Weight.LEVEL))
+        named += [(record["id"], text, weight) for text, weight in _of_a_scan(record, spread_nm)]
+    found = [
+        Finding(scan=name, text=text, weight=weight)
+        for name, text, weight in (*named, *_of_the_card(records, prints, card))
+    ]
     return sorted(found, key=lambda one: (one.weight, one.scan != ALL, one.scan))
 
 
-def _of_the_card(records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card) -> list[Finding]:
-    """Numbers of the card that all scans together contradict."""
-    layout, found = card.layout, []
+def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
+    """What speaks against one scan, ``spread_nm`` being the standard deviation of its heights by id."""
+    quality = record["quality"]
+    for note in record.get("notes", ()):
+        yield note, Weight.NOTE
+    if quality.get("polarity") == -1:
+        yield "its heights fall where the levels rise: is the layout or the scan inverted?", Weight.LAYOUT
+    if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
+        text = f"details lie {off:.1f} px from their place: is it the right layout and pitch?"
+        yield text, Weight.PLACE
+    if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
+        yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
+    left = quality.get("sigma_levelling_nm", 0.0)
+    if left > _LEFT * spread_nm.get(record["id"], np.inf):
+        text = f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
+        yield text, Weight.LEVEL
+
+
+def _of_the_card(
+    records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
+) -> Iterator[tuple[str, str, Weight]]:
+    """Numbers of the card that all scans together contradict: the scan, or all, what, and how bad."""
+    layout = card.layout
     times = _height_times(prints, card)
     if times and not 1 / _TIMES < times < _TIMES:
         text = (
             f"the prints rise by {times * layout.level_height_um:.3g} µm per level, {_shown(times)} "
             f"layout.level_height_um = {layout.level_height_um:g}: is that, or scan.unit, the right one?"
         )
-        found.append(Finding(scan=ALL, text=text, weight=Weight.HEIGHT))
+        yield ALL, text, Weight.HEIGHT
     scales = np.array([scale for one in records if (scale := _scale(one))])
     usual = float(np.median(scales)) if len(scales) else 1.0
     for one in records:
         if (scale := _scale(one)) and abs(scale / usual - 1) > _ODD_SCALE:
             percent = 100 * (scale / usual - 1)
             text = f"its scale is {percent:+.1f} % off that of the others: is its size the right one?"
-            found.append(Finding(scan=one["id"], text=text, weight=Weight.PITCH))
+            yield one["id"], text, Weight.PITCH
     if abs(usual - 1) > _OFF and float(np.median(np.abs(scales - usual))) < _ALIKE:
         text = (
             f"the scans are {100 * (usual - 1):+.1f} % off in scale: layout.pitch_um = {layout.pitch_um:g} "
             f"fits as {layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
         )
-        found.append(Finding(scan=ALL, text=text, weight=Weight.PITCH))
+        yield ALL, text, Weight.PITCH
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
     if 2 * highest < layout.levels - 1:
         text = f"the layouts use no level above {highest:g}, layout.levels = {layout.levels}"
-        found.append(Finding(scan=ALL, text=text, weight=Weight.HEIGHT))
-    return found
+        yield ALL, text, Weight.HEIGHT
 
 
 def _scale(record: Mapping[str, Any]) -> float:
@@ -168,10 +170,10 @@ def _shown(times: float) -> str:
     return f"{times:.3g} times" if times >= 1 else f"1/{1 / max(times, 1e-12):.3g} of"
 
 
-def verdict_of(found: Sequence[Finding], n_scans: int, most: int = 12) -> str:
+def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
     """The first words of the report: good, or what is to be done, worst first."""
     if not found:
         return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
-    shown = " · ".join(str(one) for one in found[:most])
-    more = f" · and {len(found) - most} more in the table" if len(found) > most else ""
+    shown = " · ".join(str(one) for one in found[:_SHOWN])
+    more = f" · and {len(found) - _SHOWN} more in the table" if len(found) > _SHOWN else ""
     return f"{n_scans} scans are in the store. To do, worst first — {shown}{more}"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.files import read_text
+from litho_data.foundation.files import parsed
 from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
@@ -29,14 +29,7 @@ def load_card(path: str | Path) -> Card:
             message names the key, the value and what was expected.
     """
     file = Path(path)
-    try:
-        content = tomllib.loads(read_text(file))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"cannot read {file} as a dataset card",
-            got=error,
-            wanted="a TOML file",
-        ) from error
+    content = parsed(file, tomllib.loads, f"cannot read {file} as a dataset card", "a TOML file")
     return check_card(content, f"card {file}")
 
 

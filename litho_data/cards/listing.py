@@ -1,7 +1,5 @@
 """The printed fields of a card: files found, paired by id, and described by the card's table."""
 
-from __future__ import annotations
-
 import glob
 import json
 import re
@@ -87,8 +85,8 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     file = Path(card_path)
     card = load_card(file)
     folder = _data_folder(card, file, data_dir)
-    layouts = _files_by_id(folder, card.layout.files)
-    scans = _files_by_id(folder, card.scan.files)
+    layouts = files_by_id(folder, card.layout.files)
+    scans = files_by_id(folder, card.scan.files)
     table = _table(card, folder, file.parent)
     scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
 
@@ -99,16 +97,14 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     for scan_id in ids:
         row = table.get(scan_id, {})
         use = cast(Use, row.get("use", "dataset"))
-        files = tuple(found[scan_id] for found in (layouts, scans) if scan_id in found)
+        files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
+        every = tuple(one for found in files for one in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
-            aside.append(
-                LeftAside(scan_id, tuple(one for found in files for one in found), True, f"no file {shown}")
-            )
+            aside.append(LeftAside(scan_id, every, True, f"no file {shown}"))
             continue
         print_id = print_ids[scan_id]
-        every = tuple(one for found in files for one in found)
         scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
         if not reason and (several := [found for found in files if len(found) > 1]):
@@ -152,7 +148,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:
     folders = [Path(data_dir)] if data_dir is not None else [card_path.parent, *known_folders(card.name)]
     for folder in folders:
-        if all(_files_by_id(folder, files) for files in (card.layout.files, card.scan.files)):
+        if all(files_by_id(folder, files) for files in (card.layout.files, card.scan.files)):
             return folder.resolve()
     raise InputError(
         f"files of card {card_path}",
@@ -167,7 +163,7 @@ def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
     return (files,) if isinstance(files, str) else tuple(files)
 
 
-def _files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
+def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
     """The files of each id, by one pattern or several; ``*`` stands for any part of a name."""
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):

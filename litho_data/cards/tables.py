@@ -1,7 +1,5 @@
 """The two files that a card may refer to: the table of the ids, and the full scales of images."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -12,6 +10,8 @@ from typing import get_args
 
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.files import parsed
+from litho_data.foundation.kinds import YX
 from litho_data.foundation.quantities import ORDER
 from litho_data.foundation.units import is_length
 from litho_data.readers.registry import formats
@@ -92,7 +92,7 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         raise InputError(f"{what}: pixel_size", got=repr(row["pixel_size"]), wanted="above 0: 0.5 is half")
 
 
-def size_of(text: str) -> tuple[float, float] | None:
+def size_of(text: str) -> YX | None:
     """(y, x) of a cell with one side or with both, apart by ``x``; None if it is none."""
     sides = [one.strip() for one in re.split("[x×]", text)]
     if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):
@@ -113,10 +113,7 @@ def read_full_scales(path: Path) -> dict[str, float]:
     Raises:
         InputError: no such file, no JSON object, or a value that is not a positive number.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"cannot read {path}", got=error, wanted="a JSON object, m per id") from error
+    content = parsed(path, json.loads, f"cannot read {path}", "a JSON object, m per id")
     if not isinstance(content, dict):
         raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")
     for key, value in content.items():

@@ -1,7 +1,5 @@
 """``litho-data``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -179,7 +177,7 @@ def replay(
 
     Example: litho-data replay prints.zarr P11 --array height_um
     """
-    from litho_data.provenance.replay import replay as replay_store
+    from litho_data.provenance.history import replay as replay_store
 
     table = replay_store(store, scan, arrays=array, data_dir=data_dir)
     typer.echo(table.to_string(index=False))

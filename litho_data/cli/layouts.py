@@ -1,7 +1,5 @@
 """Commands `masks` and `simulate`: parse arguments, call one function, print where the result is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

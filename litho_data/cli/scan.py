@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import NUMBER, number
 
@@ -21,7 +22,7 @@ ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")
 Format = Annotated[str, typer.Option(help=f"auto (by the content of the file), {', '.join(formats())}")]
 Unit = Annotated[str | None, typer.Option(help="unit of the heights if the file states none, e.g. m, nm")]
 Size = Annotated[
-    tuple[float, float] | None,
+    YX | None,
     typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
 ]
 ChannelName = Annotated[str | None, typer.Option(help="name of the height channel, if there are several")]
@@ -95,13 +96,10 @@ def inspect(
 
     Example: litho-data inspect P11.gwy --picture P11.png
     """
-    from rich.console import Console
-
     from litho_data.readers import list_channels, read_scan
 
-    console = Console()
     channels = list_channels(file, format=format)
-    _print_channels(console, file, channels)
+    _print_channels(file, channels)
     if header:
         for listed in channels:
             for key, value in listed.header.items():
@@ -122,10 +120,11 @@ def inspect(
             raise
         typer.echo(f"no picture: {error}")
         return
-    _print_scan(console, scan, picture)
+    _print_scan(scan, picture)
 
 
-def _print_channels(console, file: Path, channels: list[Channel]) -> None:
+def _print_channels(file: Path, channels: list[Channel]) -> None:
+    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=str(file))
@@ -143,13 +142,13 @@ def _print_channels(console, file: Path, channels: list[Channel]) -> None:
             channel.x_is,
             f"not read: {channel.problem}" if channel.problem else "yes" if channel.is_height else "no",
         )
-    console.print(table)
+    Console().print(table)
 
 
-def _print_scan(console, scan: Scan, picture: Path | None) -> None:
+def _print_scan(scan: Scan, picture: Path | None) -> None:
     import numpy as np
 
-    from litho_data.cli.scan_picture import terminal_preview, write_picture
+    from litho_data.cli.scan_picture import write_picture
 
     pitch = f"{scan.pitch_um[0]:.6g} × {scan.pitch_um[1]:.6g} µm" if scan.pitch_um else "unknown"
     low, high = np.nanmin(scan.height_um), np.nanmax(scan.height_um)
@@ -160,7 +159,5 @@ def _print_scan(console, scan: Scan, picture: Path | None) -> None:
         typer.echo(f"note: {note}")
     if scan.mask is not None:
         typer.echo(f"mask covers {scan.mask.mean():.1%} of the pixels")
-    if console.is_terminal:
-        console.print(terminal_preview(scan))
     if picture is not None:
         typer.echo(f"picture {write_picture(scan, picture)}")

@@ -1,22 +1,18 @@
-"""Pictures of a scan: a PNG with axes and scale, and a preview in the terminal."""
+"""A picture of a scan: a PNG with axes and scale."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.scan import Scan
 
-if TYPE_CHECKING:
-    from rich.text import Text
-
 _COLOURS = "viridis"
 _PERCENTILES = (0.5, 99.5)
-_PREVIEW_COLUMNS = 64
 
 
 def write_picture(scan: Scan, path: str | Path) -> Path:
@@ -51,33 +47,7 @@ def write_picture(scan: Scan, path: str | Path) -> Path:
     return target
 
 
-def terminal_preview(scan: Scan) -> Text:
-    """The heights as coloured half blocks, two rows per line of text."""
-    import matplotlib
-    from rich.color import Color
-    from rich.style import Style
-    from rich.text import Text
-
-    columns = min(_PREVIEW_COLUMNS, scan.shape[1])
-    aspect = 1.0 if scan.pitch_um is None else scan.pitch_um[0] / scan.pitch_um[1]
-    rows = max(2, round(columns * scan.shape[0] / scan.shape[1] * aspect / 2) * 2)
-    picked = scan.height_um[np.ix_(_middles(scan.shape[0], rows), _middles(scan.shape[1], columns))]
-    low, high = _limits(scan.height_um)
-    shades = np.clip((picked - low) / max(high - low, np.finfo(float).tiny), 0, 1)
-    colours = matplotlib.colormaps[_COLOURS](np.nan_to_num(shades))[..., :3] * 255
-    text = Text()
-    for top, bottom in zip(colours[::2], colours[1::2], strict=True):
-        for upper, lower in zip(top, bottom, strict=True):
-            text.append("▀", Style(color=Color.from_rgb(*upper), bgcolor=Color.from_rgb(*lower)))
-        text.append("\n")
-    return text
-
-
-def _limits(height: np.ndarray) -> tuple[float, float]:
+def _limits(height: Array) -> tuple[float, float]:
     """Limits that do not depend on a few outliers."""
     low, high = np.nanpercentile(height, _PERCENTILES)
     return float(low), float(high)
-
-
-def _middles(n: int, count: int) -> np.ndarray:
-    return ((np.arange(count) + 0.5) * n / count).astype(int)

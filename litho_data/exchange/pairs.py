@@ -4,8 +4,6 @@
 ``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -21,11 +19,13 @@ from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import noise_figures
 from litho_data.build.result import BuildResult
 from litho_data.cards.card import Card, check_card
+from litho_data.cards.listing import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import Workers
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
@@ -75,13 +75,11 @@ def import_pairs(
     card = _card(
         name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
     )
-    print_of = re.compile(card.ids.print) if card.ids.print else None
-    jobs = []
-    for order, (field_id, quadrants) in enumerate(sorted(fields.items())):
-        match = print_of.fullmatch(field_id) if print_of else None
-        jobs.append(
-            PairsJob(field_id, match["print"] if match else field_id, order, root, quadrants, scales, card)
-        )
+    ids = sorted(fields)
+    jobs = [
+        PairsJob(field_id, print_id or field_id, order, root, fields[field_id], scales, card)
+        for order, (field_id, print_id) in enumerate(zip(ids, prints_of(ids, card.ids.print), strict=True))
+    ]
     source = Source(
         card=card,
         jobs=jobs,
@@ -225,11 +223,11 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     return notes
 
 
-def _cut(image: np.ndarray, quadrant: int) -> np.ndarray:
+def _cut(image: Array, quadrant: int) -> Array:
     return image[quadrant_slices(quadrant, image.shape)]
 
 
-def _write_tiff(path: Path, image: np.ndarray) -> None:
+def _write_tiff(path: Path, image: Array) -> None:
     import tifffile
 
     photometric = "rgb" if image.ndim == 3 else "minisblack"

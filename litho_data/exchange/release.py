@@ -1,7 +1,5 @@
 """Releasing a store: as one file, or as an RO-Crate, a folder that describes itself."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from pathlib import Path

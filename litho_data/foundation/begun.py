@@ -13,8 +13,6 @@ other      anything else                            refused, and nothing is chan
 The law: a command that was stopped after any of its writes and is given again ends with the same result.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -22,14 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder, clear_leftovers, locked, writable
 from litho_data.foundation.outputs import (
-    first_addition,
-    first_difference,
     read_record,
     require_own_folder,
     require_replaceable_folder,
+    require_same,
 )
 
 BEGUN = "begun.json"
@@ -102,7 +98,7 @@ def whole_folder(
     """
     require_replaceable_folder(out, *holds)
     if record:
-        _require_same(Path(out), read_record(Path(out) / record), facts or {})
+        require_same(Path(out), read_record(Path(out) / record), facts or {})
     with atomic_folder(out, wait=False) as folder:
         yield folder
 
@@ -114,17 +110,5 @@ def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str
     # A process that was stopped before it had said what it begins has begun nothing.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
     require_own_folder(folder, record, *[BEGUN] * (own or nothing), *[holds] * bool(holds))
-    _require_same(folder, begun if own else read_record(folder / record), facts)
+    require_same(folder, begun if own else read_record(folder / record), facts)
     return own
-
-
-def _require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
-    """Refuse a folder whose result, begun or finished, was made of other facts."""
-    now = json.loads(json.dumps(facts))
-    if isinstance(held, dict) and (other := first_difference(held, now) or first_addition(held, now)):
-        raise InputError(
-            "output",
-            got=f"{folder}, which holds a result with other settings, {other.removeprefix('settings.')}",
-            wanted="the same settings, or a folder of its own",
-            hint="choose another --out, or delete the folder",
-        )

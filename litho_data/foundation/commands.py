@@ -1,7 +1,5 @@
 """The command line that results record, and a progress bar on stderr."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import time

@@ -1,7 +1,5 @@
 """The one exception that users are meant to read."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -30,7 +28,16 @@ class InputError(ValueError):
 
 
 @contextmanager
-def damaged(what: str, hint: str = "") -> Iterator[None]:
+def about(what: str) -> Iterator[None]:
+    """Errors of a block say first what it is about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
+@contextmanager
+def damaged(what: str) -> Iterator[None]:
     """Read what a program wrote and somebody may have changed since.
 
     Raises:
@@ -41,9 +48,7 @@ def damaged(what: str, hint: str = "") -> Iterator[None]:
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{what} is damaged", got=f"{type(error).__name__}: {said(error)}", hint=hint
-        ) from error
+        raise InputError(f"{what} is damaged", got=f"{type(error).__name__}: {said(error)}") from error
 
 
 def said(error: Exception) -> str:

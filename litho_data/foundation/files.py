@@ -1,17 +1,15 @@
 """Files and folders that appear whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import glob
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from litho_data.foundation.errors import InputError
 
@@ -171,6 +169,18 @@ def read_text(path: Path) -> str:
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, "a pipe or a device, no file", str(path))
     return path.read_text(encoding="utf-8")
+
+
+def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> Any:
+    """What a parser of TOML or JSON makes of a text file.
+
+    Raises:
+        InputError: about ``what``: no file, or another text than the parser takes.
+    """
+    try:
+        return parse(read_text(file))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(what, got=error, wanted=wanted) from error
 
 
 @contextmanager

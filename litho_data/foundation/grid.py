@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.quantities import PITCH_UM
 
 
@@ -25,8 +26,8 @@ class PixelGrid:
     """
 
     shape: tuple[int, int]
-    pitch_um: tuple[float, float]
-    origin_um: tuple[float, float] = (0.0, 0.0)
+    pitch_um: YX
+    origin_um: YX = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if min(self.shape) < 1:
@@ -39,16 +40,16 @@ class PixelGrid:
         return cls((int(shape[0]), int(shape[1])), (float(pitch_um), float(pitch_um)))
 
     @property
-    def size_um(self) -> tuple[float, float]:
+    def size_um(self) -> YX:
         """(y, x) extent from edge to edge, µm."""
         return self.shape[0] * self.pitch_um[0], self.shape[1] * self.pitch_um[1]
 
     @property
-    def y_um(self) -> np.ndarray:
+    def y_um(self) -> Array:
         """Row centres, shape (ny,), µm."""
         return self.origin_um[0] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um[0]
 
     @property
-    def x_um(self) -> np.ndarray:
+    def x_um(self) -> Array:
         """Column centres, shape (nx,), µm."""
         return self.origin_um[1] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um[1]

@@ -1,7 +1,5 @@
 """SHA-256 of what determines a result: files, arrays, plain data, source code."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence
@@ -9,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from litho_data.foundation.kinds import Array
 
 _BLOCK_BYTES = 1 << 20
 
@@ -22,7 +22,7 @@ def file_sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def array_sha256(array: np.ndarray, unit: str, dims: Sequence[str]) -> str:
+def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
     """Hash of a decoded array: type, shape, values, unit and dimension names, however it is chunked.
 
     Args:

@@ -1,7 +1,5 @@
 """The gate for names: what comes out of a received file and may become part of a path is a plain name."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated
 

@@ -5,8 +5,6 @@ subject (dataset, model, design) with the same settings the run resumes, or its 
 else is refused, and nothing is changed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from fnmatch import fnmatch
@@ -48,47 +46,35 @@ def require_same_settings(path: str | Path, record: str, settings: Mapping[str, 
     Args:
         path: where the result will be.
         record: the file that a finished result holds.
-        settings: fields of that file, with the values that they will have now. What an older file lacks is
-            not compared.
+        settings: fields of that file, with the values that they will have now.
 
     Raises:
         InputError: another value, which the message names.
     """
-    held = read_record(Path(path) / record)
-    now = json.loads(json.dumps(settings))
-    other = first_difference(held, now).removeprefix("settings.") if isinstance(held, dict) else ""
+    require_same(Path(path), read_record(Path(path) / record), settings)
+
+
+def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
+    """Refuse a folder whose record, of a result finished or begun, holds other facts than these."""
+    other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
             "output",
-            got=f"{path}, which holds a result with other settings, {other}",
+            got=f"{folder}, which holds a result with other settings, {other.removeprefix('settings.')}",
             wanted="the same settings, or a folder of its own",
-            hint="choose another --out",
+            hint="choose another --out, or delete the folder",
         )
 
 
 def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
-    """The first setting of ``now`` that was another one then, in words; "" if there is none.
-
-    Names that ``then`` lacks, and groups of them that are None there, are passed over.
-    """
+    """The first setting of ``now`` that was another one then, or none, in words; "" if all are the same."""
     for name, after in now.items():
-        before = then.get(name, after)
         if isinstance(after, dict):
-            if deeper := first_difference(before or {}, after, f"{path}{name}."):
+            if deeper := first_difference(then.get(name) or {}, after, f"{path}{name}."):
                 return deeper
-        elif before != after:
-            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
-            return f"{path}{name}{values}"
-    return ""
-
-
-def first_addition(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
-    """The first setting of ``now`` that ``then`` does not have, by its path; "" if there is none."""
-    for name, after in now.items():
-        if name not in then:
-            return f"{path}{name}"
-        if isinstance(after, dict) and (deeper := first_addition(then[name] or {}, after, f"{path}{name}.")):
-            return deeper
+        elif name not in then or then[name] != after:
+            short = name in then and not isinstance(after, list)
+            return f"{path}{name}" + (f" = {then[name]!r} where now {after!r} is asked" if short else "")
     return ""
 
 

@@ -1,7 +1,5 @@
 """What physical numbers can be, stated once: a type for records, and a check for everything else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -27,7 +25,7 @@ class Range:
         if isinstance(values, bool):
             return False
         try:
-            numbers = np.asarray(values, dtype=np.float64)
+            numbers = np.asarray(values, dtype=float)
         except (TypeError, ValueError, OverflowError):
             return False
         return bool(np.all((numbers >= self.low) & (numbers <= self.high)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report_pictures import DARK, LIGHT, model_colour, wide_and_narrow
+from litho_data.foundation.report_pictures import DARK, LIGHT, model_colour, svg_address
 from litho_data.foundation.run_facts import RunFacts, run_facts
 
 if TYPE_CHECKING:
@@ -137,9 +137,8 @@ class Page:
         self._tables.append((csv_name, frame))
 
     def figure(self, figure: Figure, caption: str) -> None:
-        """A matplotlib figure of :func:`new_figure`, drawn for wide and narrow screens."""
-        wide, narrow = wide_and_narrow(figure)
-        self._add("figure", caption=caption, wide=wide, narrow=narrow)
+        """A matplotlib figure of :func:`new_figure`."""
+        self._add("figure", caption=caption, address=svg_address(figure))
 
     def gallery(
         self, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[str, Sequence[str]]], caption: str

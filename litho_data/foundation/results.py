@@ -1,16 +1,15 @@
 """Result files: schema-versioned JSON, validated on writing and on reading."""
 
-from __future__ import annotations
-
 import json
 import reprlib
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, read_text
+from litho_data.foundation.files import atomic_file, parsed
 
 # An unexpected value may be of any size and nested to any depth.
 _SHORT = reprlib.Repr()
@@ -85,12 +84,8 @@ class Result(Record):
         file = Path(path)
         file = file / cls.FILE_NAME if file.is_dir() else file
         kind = "/".join(cls.SCHEMA.split("/")[:2])
-        try:
-            content: Any = json.loads(read_text(file), parse_constant=_refuse)
-        except OSError as error:
-            raise InputError(f"cannot read {file}", got=error, wanted=f"a result {kind}") from error
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"cannot read {file} as JSON", got=error, wanted=f"a result {kind}") from error
+        parse = partial(json.loads, parse_constant=_refuse)
+        content = parsed(file, parse, f"cannot read {file}", f"a result {kind}")
         schema = content.get("schema") if isinstance(content, dict) else None
         if schema not in (cls.SCHEMA, *cls.OLDER):
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))

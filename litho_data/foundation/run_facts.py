@@ -1,7 +1,5 @@
 """What every result says about the run that made it: command, commit, versions, seeds, scans."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A function and its job on the way to another process, and the result on the way back."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

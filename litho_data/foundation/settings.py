@@ -3,8 +3,6 @@
 The command lines make their options from these fields, and every field can be changed by its dotted path.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib
@@ -16,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 
 from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.files import read_text
+from litho_data.foundation.files import parsed
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -186,12 +184,7 @@ def read_settings(path: str | Path) -> dict[str, Any]:
     read = {".toml": tomllib.loads, ".json": json.loads}.get(file.suffix.lower())
     if read is None:
         raise InputError("settings file", got=str(file), wanted="a file .toml or .json")
-    try:
-        content = read(read_text(file))
-    except OSError as error:
-        raise InputError(f"settings file {file}", got=error, wanted="a file that can be read") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"settings file {file}", got=error, wanted=file.suffix[1:].upper()) from None
+    content = parsed(file, read, f"settings file {file}", file.suffix[1:].upper())
     if not isinstance(content, dict):
         raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")
     return content

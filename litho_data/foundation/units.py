@@ -1,7 +1,5 @@
 """Units of length in files: known ones are converted, all others are refused."""
 
-from __future__ import annotations
-
 from litho_data.foundation.errors import InputError
 
 NM_PER_UM = 1000.0

@@ -1,7 +1,5 @@
 """Independent jobs in this process, in local processes, or on a Dask cluster, a few at a time."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import pickle

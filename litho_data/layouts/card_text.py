@@ -1,7 +1,5 @@
 """A set of layouts on disk: one TIFF per layout, a table, and a dataset card to which scans can be added."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib
@@ -9,9 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from litho_data.cards.card import check_card
+from litho_data.foundation.kinds import YX, Array
 
 CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"
@@ -43,7 +40,7 @@ class CardText:
     pitch_um: float
     level_height_um: float
     levels: int
-    scan_size_um: tuple[float, float]
+    scan_size_um: YX
     print_pattern: str = ""
     table: bool = True
     slow_axis: str = ""
@@ -102,7 +99,7 @@ class CardText:
         return path
 
 
-def write_layout(folder: Path, scan_id: str, level: np.ndarray) -> Path:
+def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
     """Write one layout as an 8-bit TIFF of level numbers."""
     import tifffile
 

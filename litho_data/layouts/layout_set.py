@@ -1,7 +1,5 @@
 """Sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +9,7 @@ import numpy as np
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
@@ -35,7 +34,7 @@ class NamedLayout:
     """One layout with its id, relative dose, and what its scan is for."""
 
     id: str
-    level: np.ndarray
+    level: Array
     dose: float = 1.0
     use: str = "dataset"
 
@@ -45,7 +44,7 @@ class SetSettings:
     """The arguments of `write_layout_set`."""
 
     count: int
-    shape: tuple[int, int]
+    shape: Shape
     levels: int
     cutoff_per_um: float
     passband: str
@@ -65,7 +64,7 @@ def write_layout_set(
     *,
     pattern: str = "random",
     count: int = 12,
-    size_px: int | tuple[int, int] = 512,
+    size_px: int | Shape = 512,
     levels: int = 13,
     cutoff_per_um: float = 0.25,
     passband: str = "square",
@@ -175,7 +174,7 @@ def _pits(settings: SetSettings) -> Iterator[NamedLayout]:
     yield NamedLayout("pits", _features(settings, 0, settings.highest))
 
 
-def _features(settings: SetSettings, feature: int, ground: int) -> np.ndarray:
+def _features(settings: SetSettings, feature: int, ground: int) -> Array:
     widest_px = min(settings.shape) // 4 // 3
     widths_px = np.unique(np.geomspace(1, max(1, widest_px), 16).round().astype(int))
     return isolated_features(settings.shape, widths_px=widths_px.tolist(), feature=feature, ground=ground)

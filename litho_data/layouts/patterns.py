@@ -3,32 +3,30 @@
 All functions return uint8 levels of shape (ny, nx); lengths are rounded to whole pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array, Shape
 
 
-def flat(shape: tuple[int, int], *, level: int) -> np.ndarray:
+def flat(shape: Shape, *, level: int) -> Array:
     """One level everywhere: roughness, vignetting, flatness."""
     return np.full(shape, level, np.uint8)
 
 
-def step_ladder(shape: tuple[int, int], *, highest: int, lowest: int = 0) -> np.ndarray:
-    """Stairs along x from ``lowest`` to ``highest``, steps of equal width: height against level."""
-    if not 0 <= lowest < highest:
-        raise InputError("levels of a step ladder", got=(lowest, highest), wanted="0 <= lowest < highest")
-    steps = highest - lowest + 1
+def step_ladder(shape: Shape, *, highest: int) -> Array:
+    """Stairs along x from level 0 to ``highest``, steps of equal width: height against level."""
+    _positive(highest, "highest level of a step ladder")
+    steps = highest + 1
     if shape[1] < steps:
         raise InputError("width of a step ladder", got=f"{shape[1]} px", wanted=f"at least {steps} px")
-    stairs = lowest + np.arange(shape[1]) * steps // shape[1]
+    stairs = np.arange(shape[1]) * steps // shape[1]
     return _rows(stairs, shape)
 
 
-def framed_ladder(frame: np.ndarray, *, highest: int, tread_px: int, lowest: int = 0) -> np.ndarray:
+def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0) -> Array:
     """Stairs along x inside a frame that shows their position: height and roughness against level.
 
     A ladder alone looks the same wherever it is shifted along its steps, so its scan cannot be registered.
@@ -54,7 +52,7 @@ def framed_ladder(frame: np.ndarray, *, highest: int, tread_px: int, lowest: int
     return layout
 
 
-def checkerboard(shape: tuple[int, int], *, cell_px: int, high: int, low: int = 0) -> np.ndarray:
+def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Array:
     """Squares of ``cell_px``, the top left one high: lateral scale, shear, corners."""
     _positive(cell_px, "cell_px of a checkerboard")
     y, x = np.indices(shape) // cell_px
@@ -62,8 +60,8 @@ def checkerboard(shape: tuple[int, int], *, cell_px: int, high: int, low: int = 
 
 
 def line_space_sweep(
-    shape: tuple[int, int], *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
-) -> np.ndarray:
+    shape: Shape, *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
+) -> Array:
     """Lines and spaces of equal width, each pair one pixel wider: resolution against pitch.
 
     Args:
@@ -81,19 +79,17 @@ def line_space_sweep(
     return _rows(profile, shape) if along == "y" else _rows(profile, shape[::-1]).T.copy()
 
 
-def siemens_star(shape: tuple[int, int], *, spokes: int, high: int, low: int = 0) -> np.ndarray:
+def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
     """``spokes`` wedges around the centre, as wide as the gaps: resolution against direction."""
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
     # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
-    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, low).astype(np.uint8)
+    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.uint8)
 
 
-def isolated_features(
-    shape: tuple[int, int], *, widths_px: Sequence[int], feature: int, ground: int
-) -> np.ndarray:
+def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
     """Isolated squares of growing width: spot, shrinkage and collapse of single features.
 
     ``feature`` above ``ground`` makes pillars, below it pits. Each cell of the square array holds one width,
@@ -116,14 +112,14 @@ def isolated_features(
     return layout
 
 
-def relative_doses(count: int, *, spread: float = 0.3) -> np.ndarray:
-    """Doses of a dose matrix, evenly from 1 − ``spread`` to 1 + ``spread``, shape (count,)."""
-    if count < 2 or not 0 < spread < 1:
-        raise InputError("dose matrix", got=(count, spread), wanted="at least 2 doses and a spread in (0, 1)")
-    return np.linspace(1 - spread, 1 + spread, count)
+def relative_doses(count: int) -> Array:
+    """Doses of a dose matrix, evenly from 0.7 to 1.3, shape (count,)."""
+    if count < 2:
+        raise InputError("dose matrix", got=count, wanted="at least 2 doses")
+    return np.linspace(0.7, 1.3, count)
 
 
-def _rows(profile: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _rows(profile: Array, shape: Shape) -> Array:
     return np.broadcast_to(profile.astype(np.uint8), shape).copy()
 
 

@@ -1,17 +1,16 @@
 """Random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized … layout"."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array, Shape
 
 PASSBANDS = ("square", "round")
 QUANTISERS = ("round", "floor")
 
 
 def random_layout(
-    shape: tuple[int, int],
+    shape: Shape,
     *,
     levels: int = 13,
     cutoff_per_um: float = 0.25,
@@ -20,7 +19,7 @@ def random_layout(
     passband: str = "square",
     quantiser: str = "round",
     field_px: int | None = None,
-) -> np.ndarray:
+) -> Array:
     """One random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
 
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the
@@ -78,7 +77,7 @@ def random_layout(
     return level[top : top + shape[0], left : left + shape[1]]
 
 
-def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passband: str) -> np.ndarray:
+def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: str) -> Array:
     """Keep spatial frequencies up to and including ``cutoff_per_um``, with periodic boundaries."""
     require_known("passband", passband, PASSBANDS)
     if not cutoff_per_um > 0 or not pitch_um > 0:
@@ -95,7 +94,7 @@ def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passba
     return np.fft.irfft2(np.fft.rfft2(field) * (distance <= cutoff_per_um), s=field.shape)
 
 
-def quantise(unit_field: np.ndarray, levels: int, quantiser: str = "round") -> np.ndarray:
+def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
     """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below; uint8."""
     require_known("quantiser", quantiser, QUANTISERS)
     return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)

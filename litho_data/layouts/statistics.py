@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record, Result
 
 FEATURES = ("mean_level", "sd_level", "mean_jump", "extreme_share", "correlation_at_half_um")
@@ -83,9 +84,7 @@ class Departure(Record):
     worst_distance: float
 
 
-def layout_statistics(
-    layouts: Iterable[np.ndarray | Path], *, levels: int, pitch_um: float
-) -> LayoutStatistics:
+def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um: float) -> LayoutStatistics:
     """Collect the statistics of layouts, one at a time.
 
     Args:
@@ -98,9 +97,9 @@ def layout_statistics(
     """
     levels_count = np.zeros(levels, np.int64)
     jumps_count = np.zeros(levels, np.int64)
-    powers: list[np.ndarray] = []
-    correlations: list[np.ndarray] = []
-    features: list[np.ndarray] = []
+    powers: list[Array] = []
+    correlations: list[Array] = []
+    features: list[Array] = []
     for layout in layouts:
         level = _checked(layout, levels)
         levels_count += np.bincount(level.ravel(), minlength=levels)
@@ -130,7 +129,7 @@ def layout_statistics(
     )
 
 
-def departure(design: np.ndarray | Path, training: LayoutStatistics) -> Departure:
+def departure(design: Array | Path, training: LayoutStatistics) -> Departure:
     """How far one design lies outside the layouts that a model was trained on.
 
     Raises:
@@ -152,7 +151,7 @@ def departure(design: np.ndarray | Path, training: LayoutStatistics) -> Departur
     )
 
 
-def window_features(level: np.ndarray, levels: int, pitch_um: float) -> np.ndarray:
+def window_features(level: Array, levels: int, pitch_um: float) -> Array:
     """Features of the non-overlapping windows of a layout, shape (windows, len(FEATURES))."""
     ny, nx = (size // _WINDOW_PX for size in level.shape)
     windows = level[: ny * _WINDOW_PX, : nx * _WINDOW_PX].astype(float)
@@ -172,7 +171,7 @@ def window_features(level: np.ndarray, levels: int, pitch_um: float) -> np.ndarr
     )
 
 
-def _checked(layout: np.ndarray | Path, levels: int) -> np.ndarray:
+def _checked(layout: Array | Path, levels: int) -> Array:
     if isinstance(layout, Path):
         from litho_data.readers import read_layout
 
@@ -184,7 +183,7 @@ def _checked(layout: np.ndarray | Path, levels: int) -> np.ndarray:
     return layout
 
 
-def _radial_power(level: np.ndarray, pitch_um: float) -> np.ndarray:
+def _radial_power(level: Array, pitch_um: float) -> Array:
     """Power about the mean in radial bins up to the axis Nyquist frequency, normalised per layout."""
     window = np.outer(np.hanning(level.shape[0]), np.hanning(level.shape[1]))
     weighted = (level - (level * window).sum() / window.sum()) * window
@@ -198,7 +197,7 @@ def _radial_power(level: np.ndarray, pitch_um: float) -> np.ndarray:
     return power / (power.sum() or 1.0)
 
 
-def _autocorrelation(level: np.ndarray, pitch_um: float) -> np.ndarray:
+def _autocorrelation(level: Array, pitch_um: float) -> Array:
     """Autocorrelation along y and x, shape (2, lags); for a constant layout 0 except at lag 0."""
     centred = level - level.mean()
     variance = (centred**2).mean()
@@ -212,7 +211,7 @@ def _autocorrelation(level: np.ndarray, pitch_um: float) -> np.ndarray:
     return result
 
 
-def _pool(features: np.ndarray) -> WindowFeatures:
+def _pool(features: Array) -> WindowFeatures:
     mean = features.mean(axis=0)
     covariance = np.atleast_2d(np.cov(features, rowvar=False, ddof=0))
     return WindowFeatures(
@@ -224,7 +223,7 @@ def _pool(features: np.ndarray) -> WindowFeatures:
     )
 
 
-def _mahalanobis(features: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _mahalanobis(features: Array, mean: Array, covariance: Array) -> Array:
     # A feature that does not vary in the set (a flat print) still needs a scale: a thousandth of a level.
     ridge = covariance + 1e-6 * np.eye(len(mean))
     off = features - mean

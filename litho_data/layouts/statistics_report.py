@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts.statistics import LayoutStatistics
@@ -33,34 +34,30 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
 
     graphs = new_figure(11, 6)
     levels = np.arange(statistics.levels)
-    axes = graphs.add_subplot(2, 2, 1, xlabel="level", ylabel="share of pixels")
-    axes.bar(levels, statistics.level_share)
-    axes = graphs.add_subplot(
-        2, 2, 2, xlabel="jump between neighbours, levels", ylabel="share of pairs", yscale="log"
-    )
-    axes.bar(levels, statistics.jump_share)
-    axes.set_ylim(_LEAST_SHARE, 1.5)
-    axes = graphs.add_subplot(
-        2, 2, 3, xlabel="spatial frequency, cycles/µm", ylabel="share of power", yscale="log"
-    )
-    axes.step(statistics.frequency_per_um, statistics.power_share, where="mid")
-    axes.set_ylim(_LEAST_SHARE, 1.5)
-    axes = graphs.add_subplot(2, 2, 4, xlabel="lag, µm", ylabel="autocorrelation")
-    axes.plot(statistics.lag_um, statistics.autocorrelation_x, label="along x")
-    axes.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")
-    axes.legend()
+    (of_levels, of_jumps), (of_power, of_lags) = graphs.subplots(2, 2)
+    of_levels.bar(levels, statistics.level_share)
+    of_levels.set(xlabel="level", ylabel="share of pixels")
+    shares = {"yscale": "log", "ylim": (_LEAST_SHARE, 1.5)}
+    of_jumps.bar(levels, statistics.jump_share)
+    of_jumps.set(xlabel="jump between neighbours, levels", ylabel="share of pairs", **shares)
+    of_power.step(statistics.frequency_per_um, statistics.power_share, where="mid")
+    of_power.set(xlabel="spatial frequency, cycles/µm", ylabel="share of power", **shares)
+    of_lags.plot(statistics.lag_um, statistics.autocorrelation_x, label="along x")
+    of_lags.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")
+    of_lags.set(xlabel="lag, µm", ylabel="autocorrelation")
+    of_lags.legend()
     page.figure(graphs, "Pooled statistics of the set.")
     page.heading("In numbers", folded=True)
-    shares = {
+    numbers = {
         "level or jump": levels,
         "share of pixels": statistics.level_share,
         "share of pairs": statistics.jump_share,
     }
-    page.table(shares, "Level and jump shares.", "levels.csv", digits=4)
+    page.table(numbers, "Level and jump shares.", "levels.csv", digits=4)
     return page
 
 
-def layouts_figure(levels: Mapping[str, np.ndarray], between: tuple[int, int]) -> Figure:
+def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
     """Layouts (ny, nx) side by side, by title, their levels on one scale."""
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):

@@ -1,18 +1,21 @@
 """Levelling: every operation returns the levelled map and the surface that it removed."""
 
-from __future__ import annotations
-
-from litho_data.level.facet import level_facet
-from litho_data.level.features import MaskedLevelling, mark_features, mask_and_relevel
+from litho_data.level.features import mark_features, mask_and_relevel
 from litho_data.level.layout_aware import layout_in_scan_frame, level_layout_aware
-from litho_data.level.plane import fix_zero, level_plane, level_rotate, level_three_point, zero_max, zero_mean
-from litho_data.level.polynomial import level_polynomial
+from litho_data.level.plane import (
+    fix_zero,
+    level_facet,
+    level_plane,
+    level_rotate,
+    level_three_point,
+    zero_max,
+    zero_mean,
+)
+from litho_data.level.polynomial import level_polynomial, level_robust
 from litho_data.level.recipe import Recipe
-from litho_data.level.recipe_steps import LevellingWarning
-from litho_data.level.robust import level_robust
-from litho_data.level.rows import align_rows
+from litho_data.level.rows import LevellingWarning, align_rows
 from litho_data.level.scars import mark_scars, remove_scars
-from litho_data.level.selection import Levelled, Masking
+from litho_data.level.selection import Levelled, MaskedLevelling, Masking
 
 __all__ = [
     "Levelled",

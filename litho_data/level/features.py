@@ -1,39 +1,42 @@
 """Features that levelling must not follow: marking them, and alternating between levelling and marking."""
 
-from __future__ import annotations
-
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.level.polynomial import evaluate, fit_terms, polynomial_terms
-from litho_data.level.robust import noise_sigma, robust_surface
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
+from litho_data.level.operation import operation
+from litho_data.level.polynomial import (
+    Degree,
+    evaluate,
+    fit_terms,
+    noise_sigma,
+    polynomial_terms,
+    robust_surface,
+)
+from litho_data.level.selection import MaskedLevelling, Masking, as_height, select, subtract
 
 Side = Literal["above", "below", "both"]
+Threshold = Annotated[float, Field(gt=0)]
+Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
 # With a smaller share of the pixels left, the background is a guess.
 _LEAST_BACKGROUND = 0.02
 
 
-class MaskedLevelling(NamedTuple):
-    """Result of ``mask_and_relevel``: the levelled map and the features left out."""
-
-    levelled: Levelled
-    mask: np.ndarray
-
-
+@operation("mark-features")
 def mark_features(
-    height: np.ndarray,
+    height: Array,
     *,
-    threshold: float = 3.0,
+    threshold: Threshold = 3.0,
     side: Side = "both",
-    grow_px: int = 0,
-    mask: np.ndarray | None = None,
+    grow_px: Grown = 0,
+    mask: Array | None = None,
     masking: Masking = "exclude",
-) -> np.ndarray:
+) -> Array:
     """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
 
     Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so features must be a
@@ -51,7 +54,6 @@ def mark_features(
         InputError: a threshold that is not positive, an unknown side, a negative ``grow_px``.
     """
     z = as_height(height)
-    _check(threshold, side, grow_px)
     chosen = select(z, mask, masking)
     values = z if chosen is None else z[chosen]
     centre = float(np.median(values))
@@ -60,16 +62,17 @@ def mark_features(
     return features | (np.isfinite(z) & ~usable)
 
 
+@operation("mask-and-relevel")
 def mask_and_relevel(
-    height: np.ndarray,
+    height: Array,
     *,
-    x_degree: int = 1,
-    y_degree: int = 1,
-    total_degree: int | None = 1,
-    threshold: float = 3.0,
+    x_degree: Degree = 1,
+    y_degree: Degree = 1,
+    total_degree: Degree | None = 1,
+    threshold: Threshold = 3.0,
     side: Side = "both",
-    grow_px: int = 2,
-    mask: np.ndarray | None = None,
+    grow_px: Grown = 2,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> MaskedLevelling:
     """Level, mark the features, level again without them, until the marks no longer change.
@@ -82,7 +85,6 @@ def mask_and_relevel(
         InputError: parameters outside their range, or features that leave no background.
     """
     z = as_height(height)
-    _check(threshold, side, grow_px)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     chosen = select(z, mask, masking)
     usable = np.isfinite(z) if chosen is None else chosen
@@ -95,7 +97,7 @@ def mask_and_relevel(
         background = usable & ~features
         if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(usable):
             raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
-        surface = evaluate(fit_terms(z, background.astype(np.float64), terms), z.shape)
+        surface = evaluate(fit_terms(z, background.astype(float), terms), z.shape)
         key = np.packbits(features).tobytes()
         if key in seen:
             break
@@ -103,17 +105,7 @@ def mask_and_relevel(
     return MaskedLevelling(subtract(z, surface), features | (np.isfinite(z) & ~usable))
 
 
-def _check(threshold: float, side: str, grow_px: int) -> None:
-    if not threshold > 0:
-        raise InputError("feature threshold", got=threshold, wanted="a positive number of noise sigmas")
-    require_known("side of the features", side, get_args(Side))
-    if grow_px < 0:
-        raise InputError("grow_px", got=grow_px, wanted="0 or more pixels")
-
-
-def _off_surface(
-    residual: np.ndarray, usable: np.ndarray, limit: float, side: Side, grow_px: int
-) -> np.ndarray:
+def _off_surface(residual: Array, usable: Array, limit: float, side: Side, grow_px: int) -> Array:
     with np.errstate(invalid="ignore"):
         above, below = residual > limit, residual < -limit
     marked = usable & (above if side == "above" else below if side == "below" else above | below)

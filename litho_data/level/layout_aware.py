@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage
 
 from litho_data.foundation.errors import InputError
-from litho_data.level.polynomial import Terms, evaluate, polynomial_terms
+from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.level.operation import operation
+from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 if TYPE_CHECKING:
@@ -21,15 +24,16 @@ _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _LEAST_INSIDE = 0.25
 
 
+@operation("layout-aware")
 def level_layout_aware(
-    height: np.ndarray,
+    height: Array,
     *,
-    layout_level: np.ndarray,
-    blur_px: float | None = None,
-    x_degree: int = 1,
-    y_degree: int = 1,
-    total_degree: int | None = 1,
-    mask: np.ndarray | None = None,
+    layout_level: Array,
+    blur_px: Annotated[float, Field(ge=0)] | None = None,
+    x_degree: Degree = 1,
+    y_degree: Degree = 1,
+    total_degree: Degree | None = 1,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the background that remains once the layout has explained what it can.
@@ -55,8 +59,6 @@ def level_layout_aware(
     z = as_height(height)
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
-    if blur_px is not None and blur_px < 0:
-        raise InputError("blur_px", got=blur_px, wanted="0 or more pixels")
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
     if not terms:
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
@@ -66,13 +68,13 @@ def level_layout_aware(
     fitted = inside if chosen is None else chosen & inside
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
-    level = np.asarray(layout_level, dtype=np.float64)
+    level = np.asarray(layout_level, dtype=float)
     fits = [_joint_fit(z, _blur(level, blur), fitted, terms) for blur in blurs]
     surface = evaluate(min(fits, key=lambda fit: fit[1])[0], z.shape)
     return subtract(z, surface - surface[fitted].mean())
 
 
-def _inside(known: np.ndarray, border_px: float) -> np.ndarray:
+def _inside(known: Array, border_px: float) -> Array:
     """The known pixels that are further than a border from unknown ones; all of them if few are left."""
     if known.all():
         return known
@@ -81,13 +83,13 @@ def _inside(known: np.ndarray, border_px: float) -> np.ndarray:
 
 
 def layout_in_scan_frame(
-    layout_level: np.ndarray,
-    scan_to_layout: np.ndarray,
-    scan_shape: tuple[int, int],
-    scan_pitch_um: tuple[float, float],
+    layout_level: Array,
+    scan_to_layout: Array,
+    scan_shape: Shape,
+    scan_pitch_um: YX,
     layout_pitch_um: float,
     bend_um: Bend | None = None,
-) -> np.ndarray:
+) -> Array:
     """The level of the layout pixel under each scan pixel; NaN outside the layout.
 
     Args:
@@ -113,19 +115,17 @@ def layout_in_scan_frame(
     return levels
 
 
-def _blur(level: np.ndarray, sigma_px: float) -> np.ndarray:
+def _blur(level: Array, sigma_px: float) -> Array:
     """Gaussian blur over the known pixels only; unknown ones stay unknown."""
     if sigma_px == 0:
         return level
     known = np.isfinite(level)
-    weight = ndimage.gaussian_filter(known.astype(np.float64), sigma_px)
+    weight = ndimage.gaussian_filter(known.astype(float), sigma_px)
     spread = ndimage.gaussian_filter(np.where(known, level, 0.0), sigma_px)
     return np.where(known, spread / np.where(weight > 0, weight, 1.0), np.nan)
 
 
-def _joint_fit(
-    z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms
-) -> tuple[np.ndarray, float]:
+def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
     """Coefficients of the background, in the Legendre basis of ``evaluate``; and how little was explained."""
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
@@ -145,9 +145,7 @@ def _joint_fit(
     return coefficients, -float(right @ solution)
 
 
-def _normal_equations(
-    z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms
-) -> tuple[np.ndarray, np.ndarray]:
+def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, Array]:
     """Summed over strips of rows, so that the design matrix never exists as a whole."""
     x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))

@@ -1,16 +1,18 @@
-"""Polynomial background, with the definition of Gwyddion's Polynomial Background."""
-
-from __future__ import annotations
+"""Polynomial backgrounds: by least squares, as in Gwyddion, and of the majority of the pixels."""
 
 from functools import lru_cache
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.polynomial import legendre
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
+from litho_data.foundation.kinds import Array, Shape
+from litho_data.level.operation import operation
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
 
-MAX_DEGREE = 11
+Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
 # Below it, the smallest direction of the normal matrix is rounding noise.
@@ -18,13 +20,14 @@ _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
 
 
+@operation("polynomial")
 def level_polynomial(
-    height: np.ndarray,
+    height: Array,
     *,
-    x_degree: int = 3,
-    y_degree: int = 3,
-    total_degree: int | None = None,
-    mask: np.ndarray | None = None,
+    x_degree: Degree = 3,
+    y_degree: Degree = 3,
+    total_degree: Degree | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the least-squares polynomial, its constant included.
@@ -43,15 +46,13 @@ def level_polynomial(
     z = as_height(height)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(np.float64)
+    weights = None if chosen is None else chosen.astype(float)
     return subtract_product(z, *surface_factors(fit_terms(z, weights, terms), z.shape))
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
-    """The exponents (p, q) of x^p y^q; raises InputError for a degree outside 0..11."""
+    """The exponents (p, q) of x^p y^q."""
     degrees = (x_degree, y_degree) if total_degree is None else (total_degree, total_degree)
-    if not all(0 <= degree <= MAX_DEGREE for degree in degrees):
-        raise InputError("degree of the background", got=degrees, wanted=f"0 to {MAX_DEGREE}")
     return tuple(
         (p, q)
         for q in range(degrees[1] + 1)
@@ -60,7 +61,7 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
     )
 
 
-def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.ndarray:
+def fit_terms(z: Array, weights: Array | None, terms: Terms) -> Array:
     """Weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), P the Legendre polynomials.
 
     x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the
@@ -95,13 +96,13 @@ def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.nda
     return coefficients
 
 
-def evaluate(coefficients: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def evaluate(coefficients: Array, shape: Shape) -> Array:
     """The surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
     along_y, along_x = surface_factors(coefficients, shape)
     return along_y @ along_x
 
 
-def surface_factors(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def surface_factors(coefficients: Array, shape: Shape) -> tuple[Array, Array]:
     """(ny, k) and (k, nx): the surface of ``fit_terms``'s coefficients is their product."""
     basis_y = _basis(shape[0], coefficients.shape[0] - 1)
     basis_x = _basis(shape[1], coefficients.shape[1] - 1)
@@ -109,19 +110,19 @@ def surface_factors(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[n
 
 
 @lru_cache(maxsize=64)
-def _basis(n: int, degree: int) -> np.ndarray:
+def _basis(n: int, degree: int) -> Array:
     basis = legendre.legvander(np.linspace(-1.0, 1.0, n), degree)
     basis.flags.writeable = False
     return basis
 
 
 def _normal_matrix(
-    weights: np.ndarray | None,
-    basis_x: np.ndarray,
-    basis_y: np.ndarray,
+    weights: Array | None,
+    basis_x: Array,
+    basis_y: Array,
     powers_x: list[int],
     powers_y: list[int],
-) -> np.ndarray:
+) -> Array:
     if weights is None:
         gram_x, gram_y = basis_x.T @ basis_x, basis_y.T @ basis_y
         return gram_x[np.ix_(powers_x, powers_x)] * gram_y[np.ix_(powers_y, powers_y)]
@@ -132,12 +133,12 @@ def _normal_matrix(
     return moments[q[:, None], q[None, :], p[:, None], p[None, :]]
 
 
-def _pairs(basis: np.ndarray) -> np.ndarray:
+def _pairs(basis: Array) -> Array:
     """(n, d^2): products of any two columns."""
     return (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
 
 
-def _eigen_factors(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _eigen_factors(normal: Array) -> tuple[Array, Array]:
     scales, directions = np.linalg.eigh(normal)
     if scales[0] <= _SINGULAR * scales[-1]:
         raise InputError(
@@ -148,6 +149,78 @@ def _eigen_factors(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return scales, directions
 
 
-def _solve(factors: tuple[np.ndarray, np.ndarray], right: np.ndarray) -> np.ndarray:
+def _solve(factors: tuple[Array, Array], right: Array) -> Array:
     scales, directions = factors
     return directions @ ((directions.T @ right) / scales)
+
+
+Loss = Literal["huber", "tukey"]
+# Widths in units of the noise at which 95 % of the efficiency of least squares is kept under
+# Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
+_WIDTH = {"huber": 1.345, "tukey": 4.685}
+_MAD_TO_SIGMA = 1.4826
+_MAX_ROUNDS = 200
+# A change of the surface, in units of the noise, that is too small to matter.
+_SETTLED = 1e-7
+
+
+@operation("robust")
+def level_robust(
+    height: Array,
+    *,
+    x_degree: Degree = 1,
+    y_degree: Degree = 1,
+    total_degree: Degree | None = 1,
+    loss: Loss = "tukey",
+    mask: Array | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Subtract the robust polynomial with its constant: the main surface then lies at zero.
+
+    Iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
+    weight to distant features and starts from the Huber solution, which has a single minimum.
+
+    Args:
+        height: (ny, nx), any unit.
+        x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
+
+    Raises:
+        InputError: an unknown loss, or pixels that do not determine the polynomial.
+    """
+    z = as_height(height)
+    terms = polynomial_terms(x_degree, y_degree, total_degree)
+    return subtract(z, robust_surface(z, select(z, mask, masking), terms, loss))
+
+
+def robust_surface(z: Array, chosen: Array | None, terms: Terms, loss: Loss = "tukey") -> Array:
+    """The robust polynomial on all pixels, fitted to the chosen ones."""
+    usable = np.isfinite(z) if chosen is None else chosen
+    base = usable.astype(float)
+    surface = evaluate(fit_terms(z, base, terms), z.shape)
+    surface = _reweight(z, base, usable, terms, "huber", surface)
+    return surface if loss == "huber" else _reweight(z, base, usable, terms, "tukey", surface)
+
+
+def noise_sigma(residual: Array) -> float:
+    """1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare outliers."""
+    return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
+
+
+def _reweight(z: Array, base: Array, usable: Array, terms: Terms, loss: Loss, surface: Array) -> Array:
+    for _ in range(_MAX_ROUNDS):
+        residual = np.where(usable, z - surface, 0.0)
+        sigma = noise_sigma(residual[usable])
+        if sigma <= np.finfo(float).eps * float(np.abs(z[usable]).max()):
+            return surface
+        weights = base * _weights(residual / sigma, loss)
+        previous, surface = surface, evaluate(fit_terms(z, weights, terms), z.shape)
+        if float(np.abs(surface - previous).max()) < _SETTLED * sigma:
+            return surface
+    return surface
+
+
+def _weights(scaled: Array, loss: Loss) -> Array:
+    width = _WIDTH[loss]
+    if loss == "huber":
+        return width / np.maximum(np.abs(scaled), width)
+    return np.clip(1 - (scaled / width) ** 2, 0.0, None) ** 2

@@ -1,28 +1,38 @@
 """Levelling recipes: a list of steps, written in TOML or Python and stored with the data."""
 
-from __future__ import annotations
-
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, Union
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import read_text
+import litho_data.level.features
+import litho_data.level.layout_aware
+
+# Each adds its operations.
+import litho_data.level.plane
+import litho_data.level.polynomial
+import litho_data.level.scars  # noqa: F401
+from litho_data.foundation.errors import InputError, about
+from litho_data.foundation.files import parsed
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import first_error
-from litho_data.level.recipe_steps import AnyStep, LevellingWarning, State
+from litho_data.level.operation import STEPS, State, Step
+from litho_data.level.rows import LevellingWarning
 from litho_data.level.selection import Levelled, as_height
 from litho_data.scan import Scan
+
+if TYPE_CHECKING:
+    AnyStep = Step
+else:
+    AnyStep = Annotated[Union[tuple(STEPS.values())], Field(discriminator="op")]  # noqa: UP007
 
 
 class Recipe(BaseModel):
     """Levelling steps in the order in which they are applied; an unknown key is an error.
 
-    In TOML each step is a table ``[[step]]`` with its operation as ``op``; in Python the steps are
-    the models of ``litho_data.level.recipe_steps``.
+    In TOML each step is a table ``[[step]]`` with its operation as ``op``, in Python one of ``STEPS``.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/recipe/1"
@@ -39,10 +49,7 @@ class Recipe(BaseModel):
         Raises:
             InputError: no such file, no TOML, an unknown operation or key, a value out of range.
         """
-        try:
-            content = tomllib.loads(read_text(Path(path)))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"cannot read recipe {path}", got=error, wanted="a TOML file") from error
+        content = parsed(Path(path), tomllib.loads, f"cannot read recipe {path}", "a TOML file")
         return cls.from_dict(content, source=str(path))
 
     @classmethod
@@ -62,11 +69,11 @@ class Recipe(BaseModel):
 
     def apply(
         self,
-        scan: Scan | np.ndarray,
+        scan: Scan | Array,
         *,
-        pitch_um: tuple[float, float] | None = None,
-        mask: np.ndarray | None = None,
-        layout_level: np.ndarray | None = None,
+        pitch_um: YX | None = None,
+        mask: Array | None = None,
+        layout_level: Array | None = None,
     ) -> Levelled:
         """Level a scan; ``height + removed`` is the input, both NaN where nothing was measured.
 
@@ -88,13 +95,11 @@ class Recipe(BaseModel):
         state = State(as_height(heights), mask, pitch_um, layout_level)
         start = state.height_um
         for number, step in enumerate(self.step, start=1):
-            try:
+            with about(f"recipe step {number} ({step.op})"):
                 state = step.run(state)
-            except InputError as error:
-                raise InputError(f"recipe step {number} ({step.op}): {error}") from error
         return Levelled(state.height_um, start - state.height_um)
 
-    def apply_noting(self, scan: Scan | np.ndarray, **arguments: Any) -> tuple[Levelled, list[str]]:
+    def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
         """The result of ``apply``, and in words what its steps warn of instead of warnings."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)

@@ -3,9 +3,9 @@
 Each function takes (rows, n) values and the selection of the same shape, or None for all of it.
 """
 
-from __future__ import annotations
-
 import numpy as np
+
+from litho_data.foundation.kinds import Array
 
 # From this trim on, only the median is left.
 MEDIAN_TRIM = 0.5
@@ -19,7 +19,7 @@ _FACET_SHARPNESS, _FACET_PASSES, _FACET_SMALLEST_STEP = 1 / 200, 30, 1e-6
 _FEWEST_SLOPES = 4
 
 
-def row_counts(values: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+def row_counts(values: Array, chosen: Array | None) -> Array:
     """Number of selected values per row, int (rows,)."""
     if chosen is None:
         return np.full(len(values), values.shape[1])
@@ -31,7 +31,7 @@ def fewest_for_row(n: int) -> int:
     return int(np.floor(np.log(n) + 1.5))
 
 
-def row_trimmed_mean(values: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.ndarray:
+def row_trimmed_mean(values: Array, chosen: Array | None, trim: float) -> Array:
     """Mean of sorted[t : n - t], t = floor(trim n + 0.5); from trim 0.5 on sorted[n // 2].
 
     For even n that upper median differs from the mean of the two middle values. A row without
@@ -51,7 +51,7 @@ def row_trimmed_mean(values: np.ndarray, chosen: np.ndarray | None, trim: float)
     return np.where(kept, ordered, 0.0).sum(axis=1) / np.maximum(kept.sum(axis=1), 1)
 
 
-def row_modus(values: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+def row_modus(values: Array, chosen: Array | None) -> Array:
     """Mean of the middle third of the shortest window that holds round(sqrt n) sorted values.
 
     Below 9 values the upper median; a row without selected values gives 0. Windows of heights with few
@@ -65,7 +65,7 @@ def row_modus(values: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
     return np.array([_modus(row[:count], row_m[:count]) for row, row_m, count in rows])
 
 
-def row_facet_tilt(values: np.ndarray, chosen: np.ndarray | None, pitch_um: float) -> np.ndarray:
+def row_facet_tilt(values: Array, chosen: Array | None, pitch_um: float) -> Array:
     """Slope per pixel of the prevailing 1-D facet of each row, from neighbours that are both selected.
 
     Each row is levelled up to 30 times, until its slope changes by less than 1e-6.
@@ -75,7 +75,7 @@ def row_facet_tilt(values: np.ndarray, chosen: np.ndarray | None, pitch_um: floa
     return np.array([_facet_slope(row[use]) for row, use in zip(slopes, usable, strict=True)]) * pitch_um
 
 
-def _facet_slope(slopes: np.ndarray) -> float:
+def _facet_slope(slopes: Array) -> float:
     total = 0.0
     if len(slopes) < _FEWEST_SLOPES:
         return total
@@ -93,7 +93,7 @@ def _facet_slope(slopes: np.ndarray) -> float:
     return total
 
 
-def _dense_trimmed_mean(values: np.ndarray, trim: float) -> np.ndarray:
+def _dense_trimmed_mean(values: Array, trim: float) -> Array:
     n = values.shape[1]
     cut = int(np.floor(trim * n + 0.5))
     if trim >= MEDIAN_TRIM or 2 * cut >= n:
@@ -103,7 +103,7 @@ def _dense_trimmed_mean(values: np.ndarray, trim: float) -> np.ndarray:
     return np.partition(values, (cut, n - cut - 1), axis=1)[:, cut : n - cut].mean(axis=1)
 
 
-def _modus(ordered: np.ndarray, metres: np.ndarray) -> float:
+def _modus(ordered: Array, metres: Array) -> float:
     n = len(ordered)
     if n < _FEW_FOR_MODUS:
         return float(ordered[n // 2]) if n else 0.0
@@ -112,7 +112,7 @@ def _modus(ordered: np.ndarray, metres: np.ndarray) -> float:
     return float(ordered[start + window // 3 : start + window - window // 3].mean())
 
 
-def _decimal_metres(height_um: np.ndarray) -> np.ndarray:
+def _decimal_metres(height_um: Array) -> Array:
     """The doubles that a file in metres with up to 12 digits would have been read as."""
     metres = height_um * METRE_PER_UM
     with np.errstate(divide="ignore", invalid="ignore"):

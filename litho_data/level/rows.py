@@ -1,12 +1,14 @@
 """Row alignment, with the definitions of Gwyddion's Align Rows."""
 
-from __future__ import annotations
-
-from typing import Literal, get_args
+import warnings
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
+from litho_data.level.operation import State, Step, operation
 from litho_data.level.row_statistics import (
     MEDIAN_TRIM,
     METRE_PER_UM,
@@ -29,19 +31,35 @@ RowMethod = Literal[
     "facet-tilt",
 ]
 Direction = Literal["horizontal", "vertical"]
-MAX_ROW_DEGREE = 5
 _SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
+class LevellingWarning(UserWarning):
+    """A step may have removed part of the print."""
+
+
+class _Aligned(Step):
+    direction: Direction = "horizontal"
+
+    def run(self, state: State) -> State:
+        """The state with the levelled map; warns where the print moves with the lines."""
+        levelled = super().run(state)
+        pair = (state.height_um, state.height_um - levelled.height_um)
+        if note := print_taken_for_offsets(*(one.T if self.direction == "vertical" else one for one in pair)):
+            warnings.warn(note, LevellingWarning, stacklevel=2)
+        return levelled
+
+
+@operation("align-rows", _Aligned)
 def align_rows(
-    height_um: np.ndarray,
+    height_um: Array,
     *,
     method: RowMethod = "median",
     direction: Direction = "horizontal",
-    degree: int = 1,
-    trim: float = 0.05,
-    pitch_um: tuple[float, float] | None = None,
-    mask: np.ndarray | None = None,
+    degree: Annotated[int, Field(ge=0, le=5)] = 1,
+    trim: Annotated[float, Field(ge=0, le=MEDIAN_TRIM)] = 0.05,
+    pitch_um: YX | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Remove from each scan line what it does not share with the others.
@@ -63,7 +81,8 @@ def align_rows(
         InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
     """
     z = as_height(height_um)
-    _check(method, direction, degree, trim, pitch_um)
+    if method == "facet-tilt" and pitch_um is None:
+        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
     chosen = select(z, mask, masking)
     if direction == "vertical":
         columns = None if chosen is None else np.ascontiguousarray(chosen.T)
@@ -74,7 +93,7 @@ def align_rows(
     return subtract(z, removed)
 
 
-def print_taken_for_offsets(z: np.ndarray, removed: np.ndarray) -> str:
+def print_taken_for_offsets(z: Array, removed: Array) -> str:
     """What to know of an alignment that moved lines although part of their pixels stayed; empty for others.
 
     An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more
@@ -90,33 +109,20 @@ def print_taken_for_offsets(z: np.ndarray, removed: np.ndarray) -> str:
     worst = int(stayed.argmax())
     if stayed[worst] < _STAYED:
         return ""
-    size = float(np.abs(shifts[stayed >= _STAYED]).max())
+    size = float(np.nanmax(np.abs(shifts[stayed >= _STAYED])))
     shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
     return f"{shifted} did not move: part of the print may be removed"
 
 
-def _check(
-    method: str, direction: str, degree: int, trim: float, pitch_um: tuple[float, float] | None
-) -> None:
-    require_known("row alignment method", method, get_args(RowMethod))
-    require_known("row alignment direction", direction, get_args(Direction))
-    if not 0 <= degree <= MAX_ROW_DEGREE:
-        raise InputError("row alignment degree", got=degree, wanted=f"0 to {MAX_ROW_DEGREE}")
-    if not 0 <= trim <= MEDIAN_TRIM:
-        raise InputError("row alignment trim", got=trim, wanted=f"0 to {MEDIAN_TRIM}")
-    if method == "facet-tilt" and pitch_um is None:
-        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
-
-
 def _removed(
-    z: np.ndarray,
-    chosen: np.ndarray | None,
+    z: Array,
+    chosen: Array | None,
     masking: Masking,
     method: RowMethod,
     degree: int,
     trim: float,
-    pitch_um: tuple[float, float] | None,
-) -> np.ndarray:
+    pitch_um: YX | None,
+) -> Array:
     if method == "polynomial" and degree > 0:
         return _row_polynomials(z, chosen, degree)
     if method == "facet-tilt":
@@ -141,7 +147,7 @@ def _removed(
     return np.broadcast_to(shifts[:, None], z.shape)
 
 
-def _level_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.ndarray:
+def _level_shifts(z: Array, chosen: Array | None, trim: float) -> Array:
     shifts = row_trimmed_mean(z, chosen, trim)
     if chosen is not None:
         too_few = row_counts(z, chosen) < fewest_for_row(z.shape[1])
@@ -149,19 +155,19 @@ def _level_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.n
     return shifts - shifts.mean()
 
 
-def _modus_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+def _modus_shifts(z: Array, chosen: Array | None) -> Array:
     shifts = row_modus(z, chosen)
     if chosen is not None:
         shifts[row_counts(z, chosen) == 0] = _overall_median(z, chosen)
     return shifts - shifts.mean()
 
 
-def _overall_median(z: np.ndarray, chosen: np.ndarray) -> float:
+def _overall_median(z: Array, chosen: Array) -> float:
     values = z[chosen]
     return float(np.partition(values, values.size // 2)[values.size // 2])
 
 
-def _difference_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.ndarray:
+def _difference_shifts(z: Array, chosen: Array | None, trim: float) -> Array:
     steps = np.diff(z, axis=0)
     both = None if chosen is None else chosen[1:] & chosen[:-1]
     step = row_trimmed_mean(steps, both, trim)
@@ -173,7 +179,7 @@ def _difference_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) ->
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
-def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None, last_column_counts: bool) -> np.ndarray:
+def _matching_shifts(z: Array, chosen: Array | None, last_column_counts: bool) -> Array:
     """Weighted mean steps between rows.
 
     Args:
@@ -197,7 +203,7 @@ def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None, last_column_count
     return shifts - shifts.mean()
 
 
-def _row_polynomials(z: np.ndarray, chosen: np.ndarray | None, degree: int) -> np.ndarray:
+def _row_polynomials(z: Array, chosen: Array | None, degree: int) -> Array:
     """The fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds back."""
     overall = float(np.nanmean(z))
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
@@ -211,5 +217,5 @@ def _row_polynomials(z: np.ndarray, chosen: np.ndarray | None, degree: int) -> n
     return fitted - overall
 
 
-def _centred(n: int) -> np.ndarray:
+def _centred(n: int) -> Array:
     return np.arange(n) - (n - 1) / 2

@@ -1,7 +1,5 @@
 """Levelling one scan: levelled heights and removed surface, in memory or as files with a record."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,6 +9,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import array_sha256, file_sha256
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.level import Recipe
@@ -30,7 +29,7 @@ class LevelRecord(RunFacts, Result):
     source: str
     source_sha256: str
     channel: str
-    pitch_um: tuple[float, float] | None
+    pitch_um: YX | None
     recipe: dict[str, Any]
     levelled: str
     levelled_sha256: str
@@ -38,7 +37,7 @@ class LevelRecord(RunFacts, Result):
     removed_sha256: str
 
 
-def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, np.ndarray]:
+def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
     """Level a scan by a recipe, or by the recipe in a TOML file.
 
     Returns:
@@ -87,9 +86,9 @@ def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
 
 def write_heights(
     path: str | Path,
-    height_um: np.ndarray,
+    height_um: Array,
     *,
-    pitch_um: tuple[float, float] | None,
+    pitch_um: YX | None,
     title: str = "",
 ) -> Path:
     """Write a height map; the suffix says how.
@@ -105,7 +104,7 @@ def write_heights(
         raise InputError(f"{file}: file type", got=repr(file.suffix), wanted=" or ".join(SUFFIXES))
     with atomic_file(file) as temporary, temporary.open("wb") as stream:
         if file.suffix == ".npy":
-            np.save(stream, np.asarray(height_um, dtype=np.float64))
+            np.save(stream, np.asarray(height_um, dtype=float))
         else:
             stream.write(gsf_bytes(height_um, pitch_um, title))
     return file

@@ -1,30 +1,35 @@
 """Scars: short strokes along the fast axis where the feedback lost the surface."""
 
-from __future__ import annotations
-
-from typing import Literal, get_args
+from functools import wraps
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
+from litho_data.level.operation import operation
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
+Threshold = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
 
 
+@operation("mark-scars")
 def mark_scars(
-    height: np.ndarray,
+    height: Array,
     *,
-    high: float = 0.666,
-    low: float = 0.25,
-    min_length_px: int = 16,
-    max_width_px: int = 4,
+    high: Threshold = 0.666,
+    low: Threshold = 0.25,
+    min_length_px: Count = 16,
+    max_width_px: Count = 4,
     sign: ScarSign = "both",
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
-) -> np.ndarray:
+) -> Array:
     """Mark strokes along the rows that stand out from the rows above and below them.
 
     A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel
@@ -40,13 +45,8 @@ def mark_scars(
         InputError: thresholds or sizes outside their range, or an unknown sign.
     """
     z = as_height(height)
-    if not 0 < low <= high or min_length_px < 1 or max_width_px < 1:
-        raise InputError(
-            "scar parameters",
-            got=f"low {low}, high {high}, min_length_px {min_length_px}, max_width_px {max_width_px}",
-            wanted="0 < low <= high and sizes of at least 1 px",
-        )
-    require_known("sign of the scars", sign, get_args(ScarSign))
+    if low > high:
+        raise InputError("scar parameters", got=f"low {low}, high {high}", wanted="low up to high")
     chosen = select(z, mask, masking)
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
@@ -60,7 +60,7 @@ def mark_scars(
     return scars if chosen is None else scars & chosen
 
 
-def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
+def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
     Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
@@ -79,7 +79,13 @@ def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
     return subtract(z, removed)
 
 
-def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
+@operation("remove-scars")
+@wraps(mark_scars)
+def _fill_scars(height: Array, **how: Any) -> Levelled:
+    return remove_scars(height, scars=mark_scars(height, **how))
+
+
+def _prominence(z: Array, max_width_px: int) -> Array:
     """By how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
@@ -93,7 +99,7 @@ def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
     return prominence
 
 
-def _long_runs(prominence: np.ndarray, low: float, high: float, min_length_px: int) -> np.ndarray:
+def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -> Array:
     along_row = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     labels, count = ndimage.label(prominence >= low, structure=along_row)
     lengths = np.bincount(labels.ravel(), minlength=count + 1)
@@ -104,7 +110,7 @@ def _long_runs(prominence: np.ndarray, low: float, high: float, min_length_px: i
     return kept[labels]
 
 
-def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+def _harmonic(z: Array, unknown: Array) -> Array:
     """Values of the unknown pixels, in the order of ``z[unknown]``."""
     n = int(np.count_nonzero(unknown))
     index = np.full(z.shape, -1)

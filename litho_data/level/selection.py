@@ -1,16 +1,14 @@
 """What all levelling operations share: the choice of pixels, and the result."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 Masking = Literal["ignore", "exclude", "include"]
-MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")
 _ROWS_IN_CACHE = 32
 
 
@@ -21,32 +19,37 @@ class Levelled(NamedTuple):
     ``removed`` is a number everywhere, and may be a read-only view where it is constant along an axis.
     """
 
-    height: np.ndarray
-    removed: np.ndarray
+    height: Array
+    removed: Array
 
 
-def as_height(height: np.ndarray) -> np.ndarray:
+class MaskedLevelling(NamedTuple):
+    """A levelled map, and the features that were left out."""
+
+    levelled: Levelled
+    mask: Array
+
+
+def as_height(height: Array) -> Array:
     """The map as contiguous float64 (ny, nx).
 
     Raises:
         InputError: not two-dimensional or below 2 x 2 pixels.
     """
-    z = np.ascontiguousarray(height, dtype=np.float64)
+    z = np.ascontiguousarray(height, dtype=float)
     if z.ndim != 2 or min(z.shape) < 2:
         raise InputError("shape of the height map", got=z.shape, wanted="(ny, nx), at least 2 x 2")
     return z
 
 
-def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarray | None:
+def select(z: Array, mask: Array | None, masking: Masking) -> Array | None:
     """Pixels that an operation may use, bool (ny, nx); None where it may use all of them.
 
     Pixels that were not measured (NaN) are never used.
 
     Raises:
-        InputError: a mask that is not boolean or has another shape, an unknown masking, or a
-            selection without any pixel.
+        InputError: a mask that is not boolean or has another shape, or a selection without any pixel.
     """
-    require_known("masking", masking, MASKINGS)
     chosen = None
     if mask is not None and masking != "ignore":
         if mask.dtype != np.bool_ or mask.shape != z.shape:
@@ -60,12 +63,12 @@ def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarr
     return chosen
 
 
-def subtract(z: np.ndarray, removed: np.ndarray) -> Levelled:
+def subtract(z: Array, removed: Array) -> Levelled:
     """The map minus the surface."""
     return Levelled(z - removed, removed)
 
 
-def subtract_product(z: np.ndarray, along_y: np.ndarray, along_x: np.ndarray) -> Levelled:
+def subtract_product(z: Array, along_y: Array, along_x: Array) -> Levelled:
     """The map minus the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
 
     A few rows at a time: the surface is then still in the cache when it is subtracted.

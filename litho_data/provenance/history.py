@@ -1,21 +1,28 @@
-"""``history``: where the arrays of a scan come from, and the records in a store that say so."""
+"""Where the arrays of a scan come from: the recorded steps, told by history and run again by replay."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.build.operations import OPERATIONS
 from litho_data.build.step import Step
 from litho_data.cards.fetch import known_folders
+from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.store.access import group_of, read_table
 from litho_data.store.read import Store, open_store
-from litho_data.store.schema import SCAN_VARIABLES
+from litho_data.store.schema import SCAN_VARIABLES, VARIABLES
 
 _HASH_DIGITS = 12
+Recorded = dict[str, list[tuple[str, Step]]]
+"""Steps of every scan in order, each with its recorded id."""
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
@@ -43,7 +50,7 @@ def history(store_path: str | Path, scan_id: str | None = None) -> str:
     return "\n".join(lines)
 
 
-def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
+def _overview(recorded: Recorded) -> Iterator[str]:
     for scan_id, steps in recorded.items():
         made: set[str] = set()
         raw = []
@@ -59,13 +66,13 @@ def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
         yield f"{scan_id}: {', '.join(raw)} -> {chain} -> {last['name']} {last['sha256'][:_HASH_DIGITS]}"
 
 
-def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
+def read_steps(store: Store) -> Recorded:
     """Recorded steps of every scan in order, each with its recorded id.
 
     Raises:
         InputError: a store without provenance, or a record that is no JSON.
     """
-    steps: dict[str, list[tuple[str, Step]]] = {}
+    steps: Recorded = {}
     for row in read_table(group_of(store.root, "provenance"), "scan").to_dict("records"):
         try:
             steps.setdefault(row["scan"], []).append(
@@ -76,7 +83,7 @@ def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
     return steps
 
 
-def steps_of(recorded: dict[str, list[tuple[str, Step]]], scan_id: str) -> list[tuple[str, Step]]:
+def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
     """The recorded steps of one scan; InputError if there is no such scan."""
     require_known("scan", scan_id, recorded)
     return recorded[scan_id]
@@ -105,7 +112,7 @@ def require_folder(data_dir: str | Path) -> Path:
     return Path(data_dir)
 
 
-def stored_array(store: Store, scan_id: str, name: str) -> np.ndarray | None:
+def stored_array(store: Store, scan_id: str, name: str) -> Array | None:
     """A scan's array by name, from the arrays over all scans or from its own group.
 
     None for the layout of a reference scan, which is not kept.
@@ -116,3 +123,93 @@ def stored_array(store: Store, scan_id: str, name: str) -> np.ndarray | None:
     if name in {variable.name for variable in SCAN_VARIABLES}:
         return store.scan_frame(scan_id, name)
     return store.sample(name, store.ids.index(scan_id)) if scan_id in store.ids else None
+
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def replay(
+    store_path: str | Path,
+    scan_ids: Sequence[str] | None = None,
+    *,
+    arrays: Sequence[str] | None = None,
+    data_dir: str | Path | None = None,
+) -> pd.DataFrame:
+    """Compute arrays again from the raw files with the recorded parameters, and compare.
+
+    Args:
+        store_path: the store.
+        scan_ids: which scans, by default all.
+        arrays: which arrays, by default all; the steps they need run in any case.
+        data_dir: folder of the raw files, as in ``verify``.
+
+    Returns:
+        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if only one of the two has a
+        number at some pixel), ``unit``, ``same_hash``.
+
+    Raises:
+        InputError: no such store, scan or array, or raw files that are missing or have changed.
+    """
+    import pandas as pd
+
+    store = open_store(store_path)
+    recorded = read_steps(store)
+    folder = raw_folder(store, data_dir)
+    if folder is None:
+        raise InputError(
+            "raw files of the store", got="none found", wanted="data_dir", hint="say where they are"
+        )
+    for name in arrays or ():
+        require_known("array", name, VARIABLES)
+    rows = []
+    for scan_id in progress(list(scan_ids or recorded), "replaying"):
+        steps = [step for _, step in steps_of(recorded, scan_id)]
+        for name, made in _recomputed(steps, folder):
+            stored = stored_array(store, scan_id, name)
+            if stored is None or (arrays and name not in arrays):
+                continue
+            variable = VARIABLES[name]
+            rows.append(
+                {
+                    "scan": scan_id,
+                    "array": name,
+                    "max_abs_difference": _largest_difference(stored, made),
+                    "unit": variable.unit,
+                    "same_hash": variable.sample_sha256(stored) == variable.sample_sha256(made),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
+    """Arrays in the order in which they are made, each step from the outputs of the steps before it."""
+    made: dict[str, Array] = {}
+    for step in steps:
+        if step.op not in OPERATIONS:
+            raise InputError("operation", got=repr(step.op), wanted=f"one of {', '.join(OPERATIONS)}")
+        files = {one["name"]: folder / one["name"] for one in step.inputs if one["name"] not in VARIABLES}
+        for one in step.inputs:
+            if one["name"] in files:
+                _require_same(files[one["name"]], one["sha256"])
+        done = OPERATIONS[step.op].run(step.params, files, made)
+        made |= done.arrays
+        yield from done.arrays.items()
+
+
+def _require_same(path: Path, sha256: str) -> None:
+    if not path.is_file():
+        raise InputError(f"raw file {path}", got="none", wanted="the file that the store was built from")
+    if file_sha256(path) != sha256:
+        raise InputError(
+            f"raw file {path}", got="another SHA-256", wanted="the file that the store was built from"
+        )
+
+
+def _largest_difference(stored: Array, made: Array) -> float:
+    if stored.shape != made.shape:
+        return float("inf")
+    a, b = (array.astype(float) for array in (stored, made))
+    if not np.array_equal(np.isnan(a), np.isnan(b)):
+        return float("inf")
+    return float(np.nanmax(np.abs(a - b), initial=0.0))

@@ -1,7 +1,5 @@
 """``verify``: is a store unchanged since its build, and are its raw files unchanged?"""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,11 +10,10 @@ import numpy as np
 
 from litho_data.build.assemble import root_attributes, table_sha256
 from litho_data.build.operations import OPERATIONS
-from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.provenance.history import raw_folder, read_steps, require_folder, stored_array
+from litho_data.provenance.history import Recorded, raw_folder, read_steps, require_folder, stored_array
 from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
 from litho_data.store.contract import file_names, missing_files, read_documents
 from litho_data.store.read import Store
@@ -155,7 +152,7 @@ def _tables(store: Store) -> Iterator[Finding]:
             yield Finding(f"table {name}", "is not the one whose hash the manifest carries")
 
 
-def _steps(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding]:
+def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
     """Each step's id compared with its content, and its inputs with the outputs before it."""
     raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
     for scan_id, steps in history.items():
@@ -176,7 +173,7 @@ def _steps(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Itera
             yield Finding(f"scan {scan_id}", "has no provenance")
 
 
-def _arrays(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding | None]:
+def _arrays(store: Store, history: Recorded) -> Iterator[Finding | None]:
     """One entry per stored array of every scan: None if it still has its hash."""
     for scan_id, steps in history.items():
         for name, wanted in ((one["name"], one["sha256"]) for _, step in steps for one in step.outputs):
@@ -224,7 +221,7 @@ def _coordinates(store: Store) -> Iterator[Finding]:
             yield Finding(f"unit of {variable.name}", problem)
 
 
-def _other_code(history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[str]:
+def _other_code(history: Recorded) -> Iterator[str]:
     used = {(step.op, step.code_sha256) for recorded in history.values() for _, step in recorded}
     other = {op for op, code in used if op not in OPERATIONS or code != OPERATIONS[op].code_sha256}
     if other:

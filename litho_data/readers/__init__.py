@@ -1,7 +1,5 @@
 """Instrument files in, ``Scan`` objects out; one module per format."""
 
-from __future__ import annotations
-
 from litho_data.readers.layout import read_layout
 from litho_data.readers.read import list_channels, read_scan
 from litho_data.readers.reader import Channel, Reader, foreign_parser

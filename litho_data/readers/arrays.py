@@ -1,7 +1,5 @@
 """Arrays that describe themselves: HDF5 of any program, NetCDF 3 and 4, MATLAB; scale, unit, axes applied."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
@@ -34,7 +33,7 @@ _NO_COORDINATE = b"This is a netCDF dimension but not"
 class Coordinate:
     """Positions along one dimension and the unit that the file states, or a stated length alone."""
 
-    values: np.ndarray | None
+    values: Array | None
     unit: str | None
     length: float | None = None
 
@@ -57,8 +56,8 @@ class Coordinate:
 def array_channel(
     name: str,
     dtype: np.dtype,
-    stored_shape: tuple[int, ...],
-    raw: Callable[[], np.ndarray],
+    stored_shape: Shape,
+    raw: Callable[[], Array],
     attributes: Mapping[str, Any],
     dims: tuple[str, str] = ("", ""),
     coordinates: Mapping[str, Coordinate] | None = None,
@@ -95,7 +94,7 @@ def array_channel(
     scaled = any(key in says for key in _APPLIED)
     return Channel(
         name=name,
-        shape=(int(shape[0]), int(shape[1])),
+        shape=shape,
         unit=str(unit) if unit not in (None, "", "1") else None,
         size_um=size_um,
         load=partial(_values, raw, says, turned),
@@ -107,7 +106,7 @@ def array_channel(
 
 
 def _changes(key: str, value: Any) -> bool:
-    number = isinstance(value, int | float | np.ndarray | list)
+    number = isinstance(value, int | float | Array | list)
     return key not in (*_APPLIED, *_MISSING, *_RANGE) and number and bool(_UNKNOWN.search(key))
 
 
@@ -115,16 +114,16 @@ def _plain(value: Any) -> Any:
     """A number, a text, or a list of numbers."""
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
-    if isinstance(value, np.ndarray):
+    if isinstance(value, Array):
         return _plain(value.reshape(-1)[0]) if value.size == 1 else value.tolist()
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _values(raw: Callable[[], np.ndarray], says: Mapping[str, Any], turned: bool) -> Loaded:
+def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool) -> Loaded:
     """Missing first, in the numbers of the file; then scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
-    values = np.asarray(raw(), dtype=np.float64)
+    values = np.asarray(raw(), dtype=float)
     bad = (values < low) | (values > high) | np.isin(values, missing)
     values = values * float(says.get("scale_factor", 1.0)) + float(says.get("add_offset", 0.0))
     values[bad] = np.nan
@@ -133,10 +132,7 @@ def _values(raw: Callable[[], np.ndarray], says: Mapping[str, Any], turned: bool
 
 def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Channel]]]) -> list[Channel]:
     with foreign_parser(path, kind):
-        channels = [one_by_one(path, kind, name, make) for name, make in made]
-    if not channels:
-        raise InputError(f"{path} ({kind}) holds no two-dimensional array of numbers")
-    return channels
+        return [one_by_one(path, kind, name, make) for name, make in made]
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
@@ -170,17 +166,17 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
     )
 
 
-def _dataset(path: Path, name: str) -> np.ndarray:
+def _dataset(path: Path, name: str) -> Array:
     import h5py
 
     with foreign_parser(path, "HDF5"), h5py.File(path) as file:
         return file[name][()]
 
 
-def _coordinate(values: np.ndarray, attributes: Mapping[str, Any]) -> Coordinate:
+def _coordinate(values: Array, attributes: Mapping[str, Any]) -> Coordinate:
     unit = attributes.get("units", attributes.get("unit"))
     length = attributes.get("length")
-    numbers = np.asarray(values, dtype=np.float64) if np.asarray(values).dtype.kind in _NUMBERS else None
+    numbers = np.asarray(values, dtype=float) if np.asarray(values).dtype.kind in _NUMBERS else None
     return Coordinate(
         numbers,
         None if unit is None else str(_plain(unit)),
@@ -210,7 +206,7 @@ def read_netcdf(path: Path) -> list[Channel]:
         )
 
 
-def _in_memory(name: str, values: np.ndarray, *described: Any) -> Channel:
+def _in_memory(name: str, values: Array, *described: Any) -> Channel:
     native = np.array(values, dtype=values.dtype.newbyteorder("="))
     return array_channel(name, native.dtype, native.shape, partial(np.array, native), *described)
 
@@ -225,7 +221,7 @@ def read_matlab(path: Path) -> list[Channel]:
     from scipy.io import loadmat
 
     with foreign_parser(path, "MATLAB"):
-        held = {name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray)}
+        held = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
     maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
     named = (
         (name, partial(_in_memory, name, one, {})) for name, one in maps.items() if one.dtype.kind in "uifc"

@@ -5,8 +5,6 @@ process per process that reads is started with the first file and kept; only a p
 costs a new one.
 """
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import os

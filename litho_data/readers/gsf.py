@@ -1,12 +1,11 @@
 """Gwyddion Simple Field, read and written: a text header, NUL padding, little-endian float32 rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.readers.reader import Channel, Reader, extent_um
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
@@ -67,14 +66,14 @@ def _count(path: Path, header: dict[str, str], key: str) -> int:
     return int(text)
 
 
-def _size_um(header: dict[str, str]) -> tuple[float, float] | None:
+def _size_um(header: dict[str, str]) -> YX | None:
     try:
         return extent_um(float(header["YReal"]), float(header["XReal"]), header.get("XYUnits"))
     except (KeyError, ValueError):
         return None
 
 
-def gsf_bytes(height_um: np.ndarray, pitch_um: tuple[float, float] | None, title: str = "") -> bytes:
+def gsf_bytes(height_um: Array, pitch_um: YX | None, title: str = "") -> bytes:
     """A GSF file of heights (ny, nx) in µm, stored as float32 metres; NaN where not measured."""
     ny, nx = height_um.shape
     fields = {"XRes": str(nx), "YRes": str(ny), "ZUnits": "m", "Title": " ".join(title.split())}

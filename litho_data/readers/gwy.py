@@ -1,7 +1,5 @@
 """Gwyddion's own files: every data field is a channel, a mask stays a mask."""
 
-from __future__ import annotations
-
 import re
 import struct
 from functools import partial
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import (
     Channel,
@@ -19,7 +18,6 @@ from litho_data.readers.reader import (
     extent_um,
     foreign_parser,
     one_by_one,
-    with_unique_names,
 )
 
 _MAGIC = b"GWYP"
@@ -46,12 +44,10 @@ def read_channels(path: Path) -> list[Channel]:
             (key for key in container if _FIELD_KEY.fullmatch(key)), key=lambda key: int(key.split("/")[1])
         )
         titles = [str(container.get(f"{key}/title", f"channel {key.split('/')[1]}")) for key in keys]
-        return with_unique_names(
-            [
-                one_by_one(path, "GWY", title, partial(_channel, path, container, key, title))
-                for key, title in zip(keys, titles, strict=True)
-            ]
-        )
+        return [
+            one_by_one(path, "GWY", title, partial(_channel, path, container, key, title))
+            for key, title in zip(keys, titles, strict=True)
+        ]
 
 
 def _channel(path: Path, container: Any, key: str, title: str) -> Channel:
@@ -68,7 +64,7 @@ def _channel(path: Path, container: Any, key: str, title: str) -> Channel:
     )
 
 
-def _load(path: Path, key: str, shape: tuple[int, int]) -> Loaded:
+def _load(path: Path, key: str, shape: Shape) -> Loaded:
     import gwyfile
 
     with foreign_parser(path, "GWY"):
@@ -81,8 +77,8 @@ def _load(path: Path, key: str, shape: tuple[int, int]) -> Loaded:
         )
 
 
-def _pixels(path: Path, key: str, field: Any, shape: tuple[int, int]) -> np.ndarray:
-    data = np.asarray(field["data"], dtype=np.float64)
+def _pixels(path: Path, key: str, field: Any, shape: Shape) -> Array:
+    data = np.asarray(field["data"], dtype=float)
     if data.size != shape[0] * shape[1]:
         raise InputError(f"{path} {key}: values", got=data.size, wanted=f"{shape[0]} x {shape[1]}")
     return data.reshape(shape)

@@ -1,7 +1,5 @@
 """HDF5 files that say whose they are: JPK's series, Nanosurf's NHF, TopoStats' results; then all others."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Shape
 from litho_data.readers import vendor
 from litho_data.readers.arrays import read_hdf5
 from litho_data.readers.confined import confined
@@ -19,7 +18,6 @@ from litho_data.readers.reader import (
     extent_um,
     foreign_parser,
     one_by_one,
-    with_unique_names,
 )
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -58,9 +56,7 @@ def read_channels(path: Path) -> list[Channel]:
             return vendor.read_channels(path)
         else:
             return read_hdf5(path, file)
-    if not channels:
-        raise InputError(f"{path} (HDF5) holds no two-dimensional channel")
-    return with_unique_names(channels)
+    return channels
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
@@ -150,13 +146,13 @@ def _first(attributes: Any, names: tuple[str, ...]) -> Any:
     return next((attributes[name] for name in names if name in attributes), None)
 
 
-def _load_nanosurf(path: Path, name: str, shape: tuple[int, int], range_: tuple[float, float]) -> Loaded:
+def _load_nanosurf(path: Path, name: str, shape: Shape, range_: tuple[float, float]) -> Loaded:
     import h5py
 
     with foreign_parser(path, "NHF"), h5py.File(path) as file:
         counts, fill = file[name][()].reshape(shape), file[name].fillvalue
     info = np.iinfo(counts.dtype)
-    values = (counts.astype(np.float64) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
+    values = (counts.astype(float) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
     return np.where(counts == fill, np.nan, values + range_[0]) if fill else values + range_[0], None
 
 
@@ -178,7 +174,7 @@ def _load_plain(path: Path, name: str) -> Loaded:
     import h5py
 
     with foreign_parser(path, "HDF5"), h5py.File(path) as file:
-        return np.asarray(file[name][()], dtype=np.float64), None
+        return np.asarray(file[name][()], dtype=float), None
 
 
 def _text(value: Any) -> str:

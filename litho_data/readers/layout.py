@@ -1,7 +1,5 @@
 """Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.readers.npy import load_array
 from litho_data.readers.registry import PICTURE, detect_format, require_file
 from litho_data.readers.tiff import open_tiff, single_sample
@@ -20,9 +19,7 @@ _WHITE = (255, 65535)
 _EXPORT = "litho-design/export/1"
 
 
-def read_layout(
-    path: str | Path, *, grey_per_level: float | None = None, levels: int | None = None
-) -> np.ndarray:
+def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels: int | None = None) -> Array:
     """Levels of a layout, uint8 (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
@@ -63,7 +60,7 @@ def read_layout(
     return found.astype(np.uint8)
 
 
-def _white_step(pixels: np.ndarray, levels: int | None) -> float:
+def _white_step(pixels: Array, levels: int | None) -> float:
     """The step of a picture whose white is the highest level; 1 for levels."""
     if levels is None or pixels.max() < levels:
         return 1.0
@@ -92,14 +89,14 @@ def _sidecar(file: Path) -> dict[str, Any]:
     return content
 
 
-def _tiff_pixels(path: Path) -> np.ndarray:
+def _tiff_pixels(path: Path) -> Array:
     with open_tiff(path) as file:
         if len(file.pages) != 1 and not _sidecar(path):
             raise InputError(f"layout {path}: pages", got=len(file.pages), wanted="one image")
         return file.pages.first.asarray()
 
 
-def _image_pixels(path: Path) -> np.ndarray:
+def _image_pixels(path: Path) -> Array:
     import cv2
 
     try:
@@ -111,7 +108,7 @@ def _image_pixels(path: Path) -> np.ndarray:
     return pixels
 
 
-def _range(pixels: np.ndarray) -> str:
+def _range(pixels: Array) -> str:
     if pixels.dtype.kind not in "uif":
         return str(pixels.dtype)
     return f"{pixels.dtype} from {pixels.min():g} to {pixels.max():g}"

@@ -1,13 +1,12 @@
 """Missing pixels that a file marks by a number or a word: named by the caller, or asked about."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers.reader import Channel
 
 # What programs write where nothing was measured.
@@ -27,8 +26,8 @@ _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
 def without_missing(
-    file: Path, channel: Channel, values: np.ndarray, missing: Sequence[float | str] | None
-) -> np.ndarray:
+    file: Path, channel: Channel, values: Array, missing: Sequence[float | str] | None
+) -> Array:
     """The values with NaN where they mark a missing pixel.
 
     Args:
@@ -47,7 +46,7 @@ def without_missing(
             shown = f"{word[:24]!r}" if word else "an empty cell"
             hint = f'if it marks pixels that were not measured: missing = ["{word[:24]}"]'
             raise InputError(f"{file} line {line}", got=shown, wanted="a number", hint=hint)
-    values = np.array(values, dtype=np.float64)
+    values = np.array(values, dtype=float)
     for number in (one for one in missing or () if not isinstance(one, str)):
         tolerance = _SAME_OF_LARGE if abs(number) > _LARGE else _SAME
         values[np.isclose(values, number, rtol=tolerance, atol=0)] = np.nan
@@ -59,7 +58,7 @@ def without_missing(
     return values
 
 
-def _marks(values: np.ndarray) -> list[tuple[float, int]]:
+def _marks(values: Array) -> list[tuple[float, int]]:
     """Extreme values that look like marks, the most extreme first, and the number of their pixels."""
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     found: list[tuple[float, int]] = []
@@ -76,7 +75,7 @@ def _marks(values: np.ndarray) -> list[tuple[float, int]]:
     return found
 
 
-def extreme_note(values: np.ndarray) -> str:
+def extreme_note(values: Array) -> str:
     """What to know of a map with one extreme value in many pixels; empty for others."""
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):

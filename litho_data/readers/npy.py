@@ -1,7 +1,5 @@
 """NumPy arrays in ``.npy`` and ``.npz`` files; pickled objects are refused."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from functools import partial
@@ -10,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import (
     MOST_BYTES_PER_PACKED_BYTE,
     Channel,
@@ -56,8 +55,6 @@ def read_archive(path: Path) -> list[Channel]:
             if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
                 name = member.filename.removesuffix(".npy")
                 channels.append(_channel(name, shape, dtype, partial(_load_member, path, name)))
-    if not channels:
-        raise InputError(f"{path} (NPZ) holds no two-dimensional array of numbers")
     return channels
 
 
@@ -66,10 +63,10 @@ def _load_member(path: Path, name: str) -> Loaded:
         return archive[name], None
 
 
-def _channel(name: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
+def _channel(name: str, shape: Shape, dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
     return Channel(
         name=name,
-        shape=(shape[0], shape[1]),
+        shape=shape,
         unit=None,
         size_um=None,
         load=load,
@@ -78,7 +75,7 @@ def _channel(name: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[
     )
 
 
-def load_array(path: Path) -> np.ndarray:
+def load_array(path: Path) -> Array:
     """The array of a ``.npy`` file, mapped and not yet read.
 
     Raises:
@@ -86,7 +83,7 @@ def load_array(path: Path) -> np.ndarray:
     """
     with foreign_parser(path, "NPY"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "uif":
+    if not isinstance(array, Array) or array.dtype.kind not in "uif":
         raise InputError(
             f"{path}: type of the values",
             got=getattr(array, "dtype", type(array).__name__),

@@ -1,7 +1,5 @@
 """Files that hold another file in packed form: gzip, and Digital Surf's compressed surfaces."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 import zlib

@@ -4,14 +4,13 @@ A grey value means value / 255 · full scale. The format has no validity, no neg
 values, so it loses accuracy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.layout import read_layout
 
 GREY_MAX = 255
@@ -19,7 +18,7 @@ GREY_MAX = 255
 
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
-) -> dict[str, np.ndarray]:
+) -> dict[str, Array]:
     """One field from its layouts and heights (first all layouts, then all heights, in quadrant order).
 
     Raises:
@@ -36,7 +35,7 @@ def stitch_field(
             f"layout {files[0]}: highest level", got=int(mask.max()), wanted=f"at most {levels - 1}"
         )
     scaled = [
-        (image.astype(np.float64) / GREY_MAX * scale).astype(np.float32)
+        (image.astype(float) / GREY_MAX * scale).astype(np.float32)
         for image, scale in zip(images[len(quadrants) :], full_scale_um, strict=True)
     ]
     height = _join(scaled, quadrants)
@@ -44,7 +43,7 @@ def stitch_field(
     return {**arrays, "valid": np.ones(height.shape, dtype=bool), "scan_to_layout": np.eye(3)}
 
 
-def quadrant_slices(quadrant: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def quadrant_slices(quadrant: int, shape: Shape) -> tuple[slice, slice]:
     """Rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
     if quadrant == 0:
         return slice(None), slice(None)
@@ -53,7 +52,7 @@ def quadrant_slices(quadrant: int, shape: tuple[int, ...]) -> tuple[slice, slice
     return slice(row * ny, (row + 1) * ny), slice(column * nx, (column + 1) * nx)
 
 
-def _join(parts: Sequence[np.ndarray], quadrants: Sequence[int]) -> np.ndarray:
+def _join(parts: Sequence[Array], quadrants: Sequence[int]) -> Array:
     factor = 1 if len(parts) == 1 else 2
     shape = (parts[0].shape[0] * factor, parts[0].shape[1] * factor)
     field = np.empty(shape, dtype=parts[0].dtype)

@@ -1,7 +1,5 @@
 """Reading one scan: format, channel, unit and size are decided here, in one place for all formats."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,10 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.units import um_per
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked
-from litho_data.readers.reader import DAMAGED, MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader
+from litho_data.readers.reader import (
+    DAMAGED,
+    MOST_BYTES_PER_PACKED_BYTE,
+    Channel,
+    Loaded,
+    Reader,
+    with_unique_names,
+)
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
@@ -28,7 +34,7 @@ def read_scan(
     *,
     format: str = "auto",
     unit: str | None = None,
-    size_um: tuple[float, float] | None = None,
+    size_um: YX | None = None,
     channel: str | None = None,
     fast_axis: Axis | None = None,
     full_scale_um: float | None = None,
@@ -109,7 +115,9 @@ def _load_packed(path: Path, format: str, name: str) -> Loaded:
 
 
 def _read_channels(reader: Reader, file: Path) -> list[Channel]:
-    channels = reader.read_channels(file)
+    channels = with_unique_names(reader.read_channels(file))
+    if not channels:
+        raise InputError(f"{file} ({reader.name}) holds no two-dimensional map of numbers")
     size = file.stat().st_size
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
@@ -145,7 +153,7 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
 
 
 def _settle_unit(
-    file: Path, channel: Channel, values: np.ndarray, unit: str | None, full_scale_um: float | None
+    file: Path, channel: Channel, values: Array, unit: str | None, full_scale_um: float | None
 ) -> tuple[str, float]:
     """The unit of the file and the factor from its values to µm."""
     if full_scale_um is not None:
@@ -167,15 +175,13 @@ def _settle_unit(
     return stated, um_per(stated)
 
 
-def _to_um(values: np.ndarray, factor: float) -> np.ndarray:
+def _to_um(values: Array, factor: float) -> Array:
     """Scaled to µm; a factor below one is applied as a division, so that 100 nm is 0.1 µm exactly."""
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
 
 
-def _settle_pitch(
-    file: Path, channel: Channel, size_um: tuple[float, float] | None, unit: str
-) -> tuple[float, float] | None:
+def _settle_pitch(file: Path, channel: Channel, size_um: YX | None, unit: str) -> YX | None:
     stated = channel.size_um or _size_of_extent(channel, unit)
     if size_um is not None:
         if len(size_um) != 2 or not all(np.isfinite(size) and size > 0 for size in size_um):
@@ -186,7 +192,7 @@ def _settle_pitch(
     return None if size is None else (size[0] / channel.shape[0], size[1] / channel.shape[1])
 
 
-def _size_of_extent(channel: Channel, unit: str) -> tuple[float, float] | None:
+def _size_of_extent(channel: Channel, unit: str) -> YX | None:
     """(y, x) in µm of coordinates without a unit: µm or that of the heights, whichever alone makes sense."""
     if channel.extent is None or channel.full_scale is not None:
         return None

@@ -1,7 +1,5 @@
 """What a reader is: it recognises a file and describes its channels before they are loaded."""
 
-from __future__ import annotations
-
 import logging
 import re
 import struct
@@ -17,6 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.scan import Axis
 
@@ -36,7 +35,7 @@ _CUT = re.compile(
 _OF_CUT_FILES = (EOFError, MemoryError, OSError, struct.error, zlib.error, BadZipFile)
 DAMAGED = "the file may be damaged"
 
-Loaded = tuple[np.ndarray, np.ndarray | None]
+Loaded = tuple[Array, Array | None]
 
 
 @dataclass(frozen=True)
@@ -60,16 +59,16 @@ class Channel:
     """
 
     name: str
-    shape: tuple[int, int]
+    shape: Shape
     unit: str | None
-    size_um: tuple[float, float] | None
+    size_um: YX | None
     load: Callable[[], Loaded]
     full_scale: float | None = None
     fast_axis: Axis | None = None
     header: dict[str, str] = field(default_factory=dict)
     problem: str = ""
     x_is: str = "a row of the file"
-    extent: tuple[float, float] | None = None
+    extent: YX | None = None
     words: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -123,16 +122,16 @@ def _refuse(problem: str) -> Loaded:
     raise InputError(problem)
 
 
-def in_memory(values: np.ndarray) -> Callable[[], Loaded]:
+def in_memory(values: Array) -> Callable[[], Loaded]:
     """What loads a map that has been read already."""
     return partial(_copied, values)
 
 
-def _copied(values: np.ndarray) -> Loaded:
+def _copied(values: Array) -> Loaded:
     return np.array(values), None
 
 
-def extent_um(y: float, x: float, unit: str | None) -> tuple[float, float] | None:
+def extent_um(y: float, x: float, unit: str | None) -> YX | None:
     """(y, x) in µm of an extent as a file states it; None without a length of two positive numbers."""
     if unit is None or not is_length(unit):
         return None

@@ -1,7 +1,5 @@
 """The formats that are read, and which of them a file has, by its content and never by its suffix."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError, unknown_name

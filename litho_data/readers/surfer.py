@@ -1,13 +1,12 @@
 """Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), y upwards."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
@@ -34,7 +33,7 @@ def read_channels(path: Path) -> list[Channel]:
     return [
         Channel(
             name="grid",
-            shape=(values.shape[0], values.shape[1]),
+            shape=values.shape,
             unit=None,
             size_um=None,
             load=in_memory(values),
@@ -43,21 +42,21 @@ def read_channels(path: Path) -> list[Channel]:
     ]
 
 
-def _text(raw: bytes) -> tuple[np.ndarray, float, float, float]:
+def _text(raw: bytes) -> tuple[Array, float, float, float]:
     cells = raw.decode("ascii").split()
     nx, ny = int(cells[1]), int(cells[2])
     x_low, x_high, y_low, y_high = (float(one) for one in cells[3:7])
-    values = np.array(cells[9:], dtype=np.float64).reshape(ny, nx)
+    values = np.array(cells[9:], dtype=float).reshape(ny, nx)
     return values, (y_high - y_low) / (ny - 1), (x_high - x_low) / (nx - 1), _BLANK
 
 
-def _binary_6(raw: bytes) -> tuple[np.ndarray, float, float, float]:
+def _binary_6(raw: bytes) -> tuple[Array, float, float, float]:
     nx, ny, x_low, x_high, y_low, y_high, _, _ = struct.unpack_from("<2h6d", raw, 4)
-    values = np.frombuffer(raw, "<f4", offset=56).reshape(ny, nx).astype(np.float64)
+    values = np.frombuffer(raw, "<f4", offset=56).reshape(ny, nx).astype(float)
     return values, (y_high - y_low) / (ny - 1), (x_high - x_low) / (nx - 1), _BLANK
 
 
-def _binary_7(raw: bytes) -> tuple[np.ndarray, float, float, float]:
+def _binary_7(raw: bytes) -> tuple[Array, float, float, float]:
     """Sections of tag, size and content; GRID holds the geometry and DATA, after it, the heights."""
     position, grid = 0, None
     while position < len(raw):

@@ -1,7 +1,5 @@
 """Nanonis SXM: a text header in sections, then big-endian float32 images, two directions per channel."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Shape
 from litho_data.readers.reader import DAMAGED, Channel, Loaded, Reader, extent_um
 
 _MAGIC = b":NANONIS_VERSION:"
@@ -70,8 +69,8 @@ def _ways(direction: str) -> tuple[str, ...]:
     return (direction,)
 
 
-def _load(path: Path, start: int, shape: tuple[int, int], upward: bool, backward: bool) -> Loaded:
-    values = np.fromfile(path, ">f4", shape[0] * shape[1], offset=start).reshape(shape).astype(np.float64)
+def _load(path: Path, start: int, shape: Shape, upward: bool, backward: bool) -> Loaded:
+    values = np.fromfile(path, ">f4", shape[0] * shape[1], offset=start).reshape(shape).astype(float)
     return np.ascontiguousarray(values[:: -1 if upward else 1, :: -1 if backward else 1]), None
 
 

@@ -1,7 +1,5 @@
 """Text files cut into blocks of numbers, each with the lines of words above it."""
 
-from __future__ import annotations
-
 import codecs
 import re
 from collections.abc import Iterator
@@ -9,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.reader import DAMAGED
 
@@ -90,7 +89,7 @@ class Block:
         stated = self.first(_MISSING)
         return [number(stated)] if NUMBER.match(stated) else []
 
-    def size_um(self, shape: tuple[int, ...]) -> tuple[float, float] | None:
+    def size_um(self, shape: Shape) -> YX | None:
         """From the two sides, or from the size of a pixel."""
         if pitch := _length_um(self.first(("pixel size",))):
             return shape[0] * pitch, shape[1] * pitch

@@ -1,7 +1,5 @@
 """Coordinates in a table of numbers: axes in its first row and column, or points that make a whole grid."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.units import is_length, um_per
 
 # Coordinates are written with few digits: a step may be off by this share of the usual one.
@@ -28,16 +27,16 @@ class Map:
 
     ``corner``: whether the first cell was that of axes."""
 
-    values: np.ndarray
-    extent: tuple[float, float] | None = None
-    size_um: tuple[float, float] | None = None
+    values: Array
+    extent: YX | None = None
+    size_um: YX | None = None
     unit: str | None = None
     x_is: str = "a row of the file"
     corner: bool = False
     notes: tuple[str, ...] = ()
 
 
-def without_axes(values: np.ndarray, words: Sequence[str]) -> Map:
+def without_axes(values: Array, words: Sequence[str]) -> Map:
     """The matrix without a first row or column of coordinates or counts.
 
     Evenly spaced numbers that the neighbouring line does not continue are coordinates: neighbouring lines of
@@ -69,12 +68,12 @@ def without_axes(values: np.ndarray, words: Sequence[str]) -> Map:
     return Map(values)
 
 
-def _rises(line: np.ndarray) -> bool:
+def _rises(line: Array) -> bool:
     steps = np.diff(line)
     return bool((steps > 0).all() or (steps < 0).all())
 
 
-def _spacing(line: np.ndarray) -> float | None:
+def _spacing(line: Array) -> float | None:
     """The step of evenly spaced numbers; None for others."""
     steps = np.diff(line)
     if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all():
@@ -83,18 +82,16 @@ def _spacing(line: np.ndarray) -> float | None:
     return step if step and np.allclose(steps, step, rtol=_UNEVEN, atol=0) else None
 
 
-def _goes_on(line: np.ndarray, step: float) -> bool:
+def _goes_on(line: Array, step: float) -> bool:
     other = _spacing(line)
     return other is not None and bool(np.isclose(other, step, rtol=_UNEVEN, atol=0))
 
 
-def _counts(line: np.ndarray) -> bool:
+def _counts(line: Array) -> bool:
     return bool(line[0] in (0, 1) and (np.diff(line) == 1).all())
 
 
-def _units(
-    words: Sequence[str], extent: tuple[float, float]
-) -> tuple[tuple[float, float] | None, str | None]:
+def _units(words: Sequence[str], extent: YX) -> tuple[YX | None, str | None]:
     """(y, x) in µm, and the unit of z, where the words above the numbers give units for x, y and z."""
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
@@ -103,7 +100,7 @@ def _units(
     return (extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])), units.get("z")
 
 
-def map_of_points(points: np.ndarray, words: Sequence[str]) -> Map | None:
+def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     """The map of points (x, y, z) that fill a regular grid; None if they do not.
 
     The rows are in the order in which the file has them, x grows to the right. Grid points that the file does

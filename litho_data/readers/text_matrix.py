@@ -1,21 +1,19 @@
 """Height maps as text: matrices, with axes, several in a file, points of a grid; read and written."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, about
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text
 from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-_CELL_WIDTH = len("-1.2345e-007\t")
 # A row of two or three numbers in a long table is a point, not a line of a map.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = 3, 3
 
@@ -46,14 +44,12 @@ def read_channels(path: Path) -> list[Channel]:
 
 def _channel(path: Path, name: str, block: Block) -> Channel:
     table = numbers_of(path, block)
-    try:
+    with about(str(path)):
         found, factor = _map_of(block, table), block.factor
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     values = found.values
     for number in block.missing:
         values = np.where(np.isclose(values, number, rtol=1e-6, atol=0), np.nan, values)
-    shape = (values.shape[0], values.shape[1])
+    shape = values.shape
     words = dict(table.words)
     if table.corner is not None and not found.corner:
         words[table.corner] = block.first_line
@@ -78,11 +74,11 @@ def _map_of(block: Block, table: Table) -> Map:
     return without_axes(table.values, block.words)
 
 
-def _may_be_points(shape: tuple[int, ...]) -> bool:
+def _may_be_points(shape: Shape) -> bool:
     return shape[1] <= _POINT_COLUMNS and shape[0] >= _POINT_ROWS_PER_COLUMN * shape[1]
 
 
-def write_text_matrix(path: str | Path, height_um: np.ndarray) -> None:
+def write_text_matrix(path: str | Path, height_um: Array) -> None:
     """Write heights with five significant digits, one line per row.
 
     Args:
@@ -93,28 +89,12 @@ def write_text_matrix(path: str | Path, height_um: np.ndarray) -> None:
     """
     if not np.isfinite(height_um).all():
         raise InputError("height in a text matrix", got="NaN or infinity", wanted="finite numbers")
-    mantissa, exponent = _five_digits(np.abs(height_um) * 1e-6)
-    text = np.empty((*height_um.shape, _CELL_WIDTH + 1), np.uint8)
-    text[:] = np.frombuffer(b"-0.0000e-000\t\n", np.uint8)
-    for place, power in zip((1, 3, 4, 5, 6), (10000, 1000, 100, 10, 1), strict=True):
-        text[..., place] = ord("0") + mantissa // power % 10
-    text[..., 8] = np.where(exponent < 0, ord("-"), ord("+"))
-    for place, power in zip((9, 10, 11), (100, 10, 1), strict=True):
-        text[..., place] = ord("0") + np.abs(exponent) // power % 10
-    text[:, -1, 12] = ord("\r")
-    keep = np.ones(text.shape, bool)
-    keep[..., 0] = height_um < 0
-    keep[:, :-1, 13] = False
-    Path(path).write_bytes(text[keep].tobytes())
-
-
-def _five_digits(magnitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(integer mantissa 10000…99999, decimal exponent); zero has mantissa and exponent 0."""
-    positive = magnitude > 0
-    exponent = np.floor(np.log10(magnitude, where=positive, out=np.zeros_like(magnitude))).astype(int)
-    mantissa = np.rint(magnitude * 10.0 ** (4 - exponent)).astype(int)
-    carried = mantissa >= 100000
-    return np.where(carried, 10000, mantissa), np.where(positive, exponent + carried, 0)
+    # No minus before a zero.
+    metres = (height_um * 1e-6 + 0.0).ravel().tolist()
+    row = "\t".join(["%.4e"] * height_um.shape[1]) + "\r\n"
+    text = row * len(height_um) % tuple(metres)
+    # Exponents of three digits, as the programs of microscopes write them.
+    Path(path).write_bytes(text.replace("e-", "e-0").replace("e+", "e+0").encode())
 
 
 def _recognises(path: Path, head: bytes) -> bool:

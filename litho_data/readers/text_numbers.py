@@ -1,7 +1,5 @@
 """Rows of text turned into numbers: separators, decimal commas, words in place of numbers, damage."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from typing import NoReturn
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers.text_blocks import Block
 
 _EXPONENT = re.compile(r"[eE][+-]?\d+$")
@@ -25,7 +24,7 @@ _TRUNCATED = "the file may be truncated"
 class Table:
     """Numbers (rows, columns), NaN for words, the first line of each word, and the word in the first cell."""
 
-    values: np.ndarray
+    values: Array
     words: dict[str, int]
     corner: str | None = None
 
@@ -50,7 +49,7 @@ def numbers_of(path: Path, block: Block) -> Table:
 def _numbers(path: Path, text: str, first_line: int) -> Table:
     text, separator = _plain(path, text, first_line)
     try:
-        values = np.loadtxt(io.StringIO(text), delimiter=separator, dtype=np.float64, comments=None, ndmin=2)
+        values = np.loadtxt(io.StringIO(text), delimiter=separator, dtype=float, comments=None, ndmin=2)
         table = Table(values, {})
     except ValueError:
         table = _cell_by_cell(path, text, separator, first_line)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
@@ -75,9 +76,7 @@ def maker_of(path: Path) -> str:
         return ""
 
 
-def _channel(
-    path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: tuple[float, float] | None
-) -> Channel:
+def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: YX | None) -> Channel:
     samples = page.samplesperpixel
     what = f"{path} page {index}"
     if page.ndim not in (2, 3) or (page.ndim == 3 and page.shape[-1] != samples):
@@ -107,7 +106,7 @@ def _is_reduced(page: Any) -> bool:
     return bool(page.is_reduced)
 
 
-def _may_hold_heights(tag: Any, shape: tuple[int, int]) -> bool:
+def _may_hold_heights(tag: Any, shape: Shape) -> bool:
     import tifffile
 
     unknown = tag.code >= _FIRST_PRIVATE and tag.code not in tifffile.TIFF.TAGS
@@ -144,19 +143,19 @@ def _plain_unit(unit: Any) -> str:
     return str(unit).replace("\\u00B5", "µ").strip()
 
 
-def _ome_pitches_um(text: str, pages: int) -> list[tuple[float, float] | None]:
+def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
     """(y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
 
     Pages belong to the images in turn, as many to each as its sizes in z, channel and time say.
     """
-    pitches: list[tuple[float, float] | None] = []
+    pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
         planes = [int(one) for one in re.findall(r'Size[ZCT]\s*=\s*"(\d{1,6})"', image)]
         pitches += [_ome_pitch_um(image)] * min(int(np.prod(planes, dtype=float)), pages)
     return pitches if len(pitches) == pages else [None] * pages
 
 
-def _ome_pitch_um(image: str) -> tuple[float, float] | None:
+def _ome_pitch_um(image: str) -> YX | None:
     """(y, x) that the element of one image states."""
     says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
@@ -166,7 +165,7 @@ def _ome_pitch_um(image: str) -> tuple[float, float] | None:
     return (pitch[0], pitch[1]) if all(0 < one < np.inf for one in pitch) else None
 
 
-def _size_um(page: Any, imagej: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float] | None:
+def _size_um(page: Any, imagej: dict[str, Any], shape: Shape) -> YX | None:
     unit = _plain_unit(imagej.get("unit", ""))
     if not is_length(unit) or _XRESOLUTION not in page.tags or _YRESOLUTION not in page.tags:
         return None
@@ -182,7 +181,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
         pixels = single_sample(path, file.pages[index].asarray())
     if (scale, offset, missing) == (1, 0, None):
         return pixels, None
-    values = pixels.astype(np.float64)
+    values = pixels.astype(float)
     bad = (
         np.isclose(values, missing, rtol=1e-7, atol=0)
         if missing is not None
@@ -191,7 +190,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
     return np.where(bad, np.nan, values * scale + offset), None
 
 
-def single_sample(path: Path, pixels: np.ndarray) -> np.ndarray:
+def single_sample(path: Path, pixels: Array) -> Array:
     """(ny, nx) from (ny, nx) or from (ny, nx, 1 to 4) whose colours are identical and which hides nothing.
 
     Raises:

@@ -1,7 +1,5 @@
 """Instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Mapping
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import (
     DAMAGED,
@@ -24,7 +23,6 @@ from litho_data.readers.reader import (
     foreign_parser,
     one_by_one,
     unknown_content,
-    with_unique_names,
 )
 from litho_data.readers.tiff import is_tiff, maker_of
 from litho_data.scan import Axis
@@ -87,12 +85,10 @@ def read_channels(path: Path) -> list[Channel]:
         channels = [
             one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
         ]
-    if not channels:
-        raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
     names = _layer_names(path, kind)
     if len(names) == len(channels) == 1 and names[0]:
         channels = [replace(channels[0], name=names[0])]
-    return with_unique_names(channels)
+    return channels
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
@@ -194,7 +190,7 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with foreign_parser(path, kind), _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
-        values = np.ma.filled(np.ma.asarray(heights, dtype=np.float64), np.nan)
+        values: Array = np.ma.filled(np.ma.asarray(heights, dtype=float), np.nan)
     return np.ascontiguousarray(values.T), None
 
 

@@ -1,12 +1,11 @@
 """Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm, ``Bad`` where missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Shape
 from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 from litho_data.readers.text_blocks import NUMBER, Block, number, read_text
 from litho_data.readers.text_numbers import numbers_of
@@ -43,14 +42,10 @@ def read_channels(path: Path) -> list[Channel]:
             position = end
         elif len(cells) > 1:
             says[cells[0]] = cells[-1]
-    if not channels:
-        raise InputError(f"{path} (Wyko ASCII) holds no heights", wanted=" or ".join(_HEIGHTS))
     return channels
 
 
-def _channel(
-    path: Path, name: str, block: Block, shape: tuple[int, int], says: dict[str, str], in_nm: bool
-) -> Channel:
+def _channel(path: Path, name: str, block: Block, shape: Shape, says: dict[str, str], in_nm: bool) -> Channel:
     if not block.rows:
         raise InputError(f"{path}: {name}", got="no numbers", hint=DAMAGED)
     table = numbers_of(path, block)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array, Shape
+
 _ITERATIONS = 30
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
@@ -23,17 +25,15 @@ class Bend:
     size (x, y), in the unit of ``amount``; u = (x - middle) / half.
     """
 
-    amount: np.ndarray
-    middle: np.ndarray
-    half: np.ndarray
+    amount: Array
+    middle: Array
+    half: Array
 
     @classmethod
-    def of_scan(
-        cls, amount_um: np.ndarray, scan_shape: tuple[int, ...], scan_pitch_um: tuple[float, float]
-    ) -> Bend:
+    def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
         """The bend of a scan of (ny, nx) pixels of a (y, x) pitch, in µm of its own frame."""
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
-        return cls(np.asarray(amount_um, dtype=np.float64), half_um, half_um)
+        return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
     @property
     def figures(self) -> dict[str, float]:
@@ -46,12 +46,12 @@ class Bend:
         return {"bend_um": self.largest, **dict(zip(names, values, strict=True))}
 
     @classmethod
-    def none_yet(cls, shape: tuple[int, int]) -> Bend:
+    def none_yet(cls, shape: Shape) -> Bend:
         """A straight scan of this (ny, nx) shape, in its index frame."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
-    def in_pixels(self, pitch_um: tuple[float, float]) -> Bend:
+    def in_pixels(self, pitch_um: YX) -> Bend:
         """A bend in µm as one in the index frame of a scan of this (y, x) pitch."""
         pitch_x_y = np.array(pitch_um[::-1])
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
@@ -60,22 +60,22 @@ class Bend:
         """The same bend in a unit that is ``1 / factor`` as long."""
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
-    def shift(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Distance (along x, along y) of points of the scan from their nominal position."""
         terms = _terms(*self.unit(x, y), self.degree)
         along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 
-    def straighten(self, points: np.ndarray) -> np.ndarray:
+    def straighten(self, points: Array) -> Array:
         """True positions of points (n, 2) of the scan."""
         return points + np.stack(self.shift(*points.T), axis=1)
 
-    def undo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
         """The points of the scan whose true position is (x, y), by Newton's method, all points at once.
 
         A position that no point has comes back far outside the frame.
         """
-        at_x, at_y = (np.array(one, dtype=np.float64) for one in np.broadcast_arrays(x, y))
+        at_x, at_y = (np.array(one, dtype=float) for one in np.broadcast_arrays(x, y))
         for _ in range(_ITERATIONS):
             shift_x, shift_y = self.shift(at_x, at_y)
             miss_x, miss_y = x - at_x - shift_x, y - at_y - shift_y
@@ -106,7 +106,7 @@ class Bend:
         gradient = np.array(self._gradient(*self._grid(2 if self.degree == 2 else 33)))
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
-    def _grid(self, count: int) -> np.ndarray:
+    def _grid(self, count: int) -> Array:
         unit = np.linspace(-1, 1, count)
         u, v = (one.ravel() for one in np.meshgrid(unit, unit))
         return self.middle[:, None] + self.half[:, None] * np.stack([u, v])
@@ -121,11 +121,11 @@ class Bend:
         """Of the polynomial: 2, or 6 for creep."""
         return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
 
-    def unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def unit(self, x: Array, y: Array) -> tuple[Array, Array]:
         """(u, v) of points."""
         return (x - self.middle[0]) / self.half[0], (y - self.middle[1]) / self.half[1]
 
-    def _gradient(self, x: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    def _gradient(self, x: Array, y: Array) -> tuple[tuple[Array, Array], ...]:
         """d(shift x)/dx, d(shift x)/dy; d(shift y)/dx, d(shift y)/dy."""
         u, v = self.unit(x, y)
         by_u = [2 * u, v, np.zeros_like(v)]
@@ -143,7 +143,7 @@ class Bend:
         )
 
 
-def _terms(u: np.ndarray, v: np.ndarray, degree: int) -> list[np.ndarray]:
+def _terms(u: Array, v: Array, degree: int) -> list[Array]:
     terms = [u * u - 1 / 3, u * v, v * v - 1 / 3]
     for k in range(3, degree + 1):
         polynomial = np.polynomial.legendre.Legendre.basis(k)
@@ -152,8 +152,8 @@ def _terms(u: np.ndarray, v: np.ndarray, degree: int) -> list[np.ndarray]:
 
 
 def fit_bent_affine(
-    points: np.ndarray, images: np.ndarray, middle: np.ndarray, half: np.ndarray, degree: int = 2
-) -> tuple[np.ndarray, Bend]:
+    points: Array, images: Array, middle: Array, half: Array, degree: int = 2
+) -> tuple[Array, Bend]:
     """The affine (3×3) and the bend that take points (n, 2) to their images, by least squares.
 
     ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame,

@@ -1,11 +1,10 @@
 """The coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.register.features import Correspondence, match_blocks, match_features
 from litho_data.register.geometry import (
     ORIENTATIONS,
@@ -38,15 +37,15 @@ class CoarseFit:
 
     orientation: str
     polarity: int
-    layout_to_oriented: np.ndarray
+    layout_to_oriented: Array
     method: str
     points: Correspondence | None
 
 
 def find_coarse(
-    scan: np.ndarray,
-    layout_level: np.ndarray,
-    smooth_layout: np.ndarray,
+    scan: Array,
+    layout_level: Array,
+    smooth_layout: Array,
     *,
     search: bool,
     features: bool,
@@ -102,14 +101,14 @@ def _attempts(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str,
 
 
 def _fit_features(
-    method: str, scan: np.ndarray, layout_level: np.ndarray, orientation: str, polarity: int, seed: int
+    method: str, scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
     """A fit from matched keypoints, or None if its inliers are too few or too clustered."""
     points = match_features(method, polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:
         return None
-    shape = (scan.shape[0], scan.shape[1])
-    layout_shape = (layout_level.shape[0], layout_level.shape[1])
+    shape = scan.shape
+    layout_shape = layout_level.shape
     from_family = np.linalg.inv(orientation_matrix(orientation, shape))
     to_layout = np.linalg.inv(linear_part(from_family @ points.layout_to_scan, centre(layout_shape)))
     # The keypoints may have found a rotation by 90° that the correlation missed.
@@ -123,9 +122,7 @@ def _fit_features(
     return CoarseFit(found, polarity, warp, method, points)
 
 
-def _fit_without_features(
-    scan: np.ndarray, layout_level: np.ndarray, hypothesis: Hypothesis, seed: int
-) -> CoarseFit:
+def _fit_without_features(scan: Array, layout_level: Array, hypothesis: Hypothesis, seed: int) -> CoarseFit:
     orientation, polarity = hypothesis.orientation, hypothesis.polarity
     points = match_blocks(
         polarity * orient(scan, orientation), layout_level, hypothesis.layout_to_oriented, seed

@@ -10,10 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
-from litho_data.register.geometry import apply_transform, warped_grid
+from litho_data.register.geometry import apply_transform, lattice, warped_grid
 from litho_data.register.pyramid import FineFit, reduced_levels
-from litho_data.register.refine import BORDER_PX, refine
+from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 # Every second pixel of the layout in both directions places the print as well as all of them.
@@ -26,9 +27,7 @@ _CHANCE = 0.01
 _BACKGROUND = 6
 
 
-def refine_with_creep(
-    scan: np.ndarray, layout_level: np.ndarray, straight: FineFit, slow: int
-) -> FineFit | None:
+def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow: int) -> FineFit | None:
     """The straight warp and a creep on top, or None if blocks held out of the fit do not prefer it.
 
     The displacement along x and y is a polynomial of degree 6 in the slow coordinate, ten numbers besides
@@ -41,7 +40,7 @@ def refine_with_creep(
         straight: what ``refine_pyramid`` found.
         slow: axis of the oriented scan along which the lines follow each other, 0 = x, 1 = y.
     """
-    straight_line = straight.refinement.layout_to_scan, Bend.none_yet((scan.shape[0], scan.shape[1]))
+    straight_line = straight.refinement.layout_to_scan, Bend.none_yet(scan.shape)
     crept = straight_line
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         small = _Images(small_scan, small_topography)
@@ -62,9 +61,7 @@ def refine_with_creep(
     return replace(straight, refinement=replace(refinement, converged=True))
 
 
-def _is_confirmed(
-    case: _Images, straight: tuple[np.ndarray, Bend], whole: tuple[np.ndarray, Bend], slow: int
-) -> bool:
+def _is_confirmed(case: _Images, straight: tuple[Array, Bend], whole: tuple[Array, Bend], slow: int) -> bool:
     from scipy.stats import wilcoxon
 
     ny, nx = case.everywhere.shape
@@ -79,7 +76,7 @@ def _is_confirmed(
             return False
         better = case.squares(*without, fold) - case.squares(*with_creep, fold)
         held_out = ~fold & np.isfinite(better)
-        sums: np.ndarray = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
+        sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
     # Ranks, because creep fades along the scan: a few blocks gain most, which says nothing against it.
     gain = np.concatenate(gains)
@@ -89,26 +86,23 @@ def _is_confirmed(
 class _Images:
     """A scan and the topography that it is compared with; warps between them fitted to any pixels."""
 
-    def __init__(self, scan: np.ndarray, topography: np.ndarray, every: int = 1):
+    def __init__(self, scan: Array, topography: Array, every: int = 1):
         """``every``: pixel of the topography is used; its index counts those that are."""
         from scipy.ndimage import spline_filter
 
         self._measured = np.isfinite(scan)
         self._spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
-        steepness = np.gradient(topography.astype(np.float64))
+        steepness = np.gradient(topography.astype(float))
         self._gradient = [every * np.asarray(one)[::every, ::every] for one in reversed(steepness)]
         topography = topography[::every, ::every]
-        shape = (topography.shape[0], topography.shape[1])
+        shape = topography.shape
         self._surface = [topography - topography.mean(), *quadratic_basis(shape)]
-        border = min(BORDER_PX // every, min(shape) // 16)
-        self.everywhere = np.pad(np.ones([n - 2 * border for n in shape], bool), border)
+        self.everywhere = interior_of(shape, BORDER_PX // every)
 
-    def fit(
-        self, matrix: np.ndarray, bend: Bend, slow: int | None, chosen: np.ndarray
-    ) -> tuple[np.ndarray, Bend] | None:
+    def fit(self, matrix: Array, bend: Bend, slow: int | None, chosen: Array) -> tuple[Array, Bend] | None:
         """Affine and, with a slow axis, creep by Gauss-Newton steps; None if they do not settle."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
-        points = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+        points = lattice(y, x)
         for _ in range(_ITERATIONS):
             warped, (rows, columns), inside = self._warped(matrix, bend)
             inside &= chosen & self.everywhere
@@ -133,7 +127,7 @@ class _Images:
                 return matrix, bend
         return None
 
-    def squares(self, matrix: np.ndarray, bend: Bend, fitted: np.ndarray) -> np.ndarray:
+    def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
         """Squared misfit of every pixel, gain and background from the fitted ones; NaN outside the scan."""
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)
@@ -142,18 +136,16 @@ class _Images:
         misfit = warped - np.einsum("k,kyx->yx", coefficients, design)
         return np.where(inside & self.everywhere, misfit**2, np.nan)
 
-    def _warped(
-        self, matrix: np.ndarray, bend: Bend
-    ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    def _warped(self, matrix: Array, bend: Bend) -> tuple[Array, tuple[Array, Array], Array]:
         from scipy.ndimage import map_coordinates
 
         places = warped_grid(matrix, self.everywhere.shape, bend)
         warped = map_coordinates(self._spline, places, order=3, mode="mirror", prefilter=False)
         seen = map_coordinates(self._measured.astype(np.float32), places, order=1, cval=0.0) > 0.999
-        return warped.astype(np.float64), places, seen
+        return warped.astype(float), places, seen
 
 
-def _flow(bend: Bend, x: np.ndarray, y: np.ndarray, slow: int | None) -> np.ndarray:
+def _flow(bend: Bend, x: Array, y: Array, slow: int | None) -> Array:
     """What can move a point of the scan along one axis: 1, u, v, and Legendre polynomials of the slow one."""
     unit = bend.unit(x, y)
     flows = [np.ones_like(unit[0]), *unit]
@@ -162,7 +154,7 @@ def _flow(bend: Bend, x: np.ndarray, y: np.ndarray, slow: int | None) -> np.ndar
     return np.stack(flows)
 
 
-def _solve(design: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _solve(design: Array, values: Array) -> Array:
     normal = design.T @ design
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))

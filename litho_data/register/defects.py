@@ -4,14 +4,13 @@ Such an area pulls a least-squares warp by pixels. Its heights differ from what 
 times the usual misfit over a connected area, whatever the response of the printer is.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.register.flows import Model
-from litho_data.register.geometry import apply_transform, corners, overlap_of, warped_grid
+from litho_data.register.geometry import apply_transform, corners, nearest, overlap_of, warped_grid
 from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
@@ -43,8 +42,8 @@ _PASSES = 8
 
 
 def refine_around_defects(
-    plain: FineFit, scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray, model: Model
-) -> tuple[FineFit, np.ndarray | None]:
+    plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
+) -> tuple[FineFit, Array | None]:
     """The fit of what shows the print, and the defects, bool (ny, nx) of the layout; or the plain fit.
 
     The coarse warp is robust and starts every round: defects are found under the last warp, and the warp
@@ -69,14 +68,14 @@ def refine_around_defects(
         defects = found
         if not fine.refinement.converged:
             return plain, None
-        ends = corners((layout_level.shape[0], layout_level.shape[1]))
+        ends = corners(layout_level.shape)
         moved = apply_transform(fine.refinement.layout_to_scan, ends) - apply_transform(warp, ends)
         if np.abs(moved).max() < _SETTLED_PX:
             break
     return (fine, defects) if largest_sigma >= DEFECT_SIGMA else (plain, None)
 
 
-def find_defects(scan: np.ndarray, fine: FineFit) -> tuple[np.ndarray, float]:
+def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     """Pixels of the layout that show something else than the print, with a margin, and their largest misfit.
 
     The misfit is the scan on the layout's pixels minus a free function of the predicted topography
@@ -113,16 +112,15 @@ def find_defects(scan: np.ndarray, fine: FineFit) -> tuple[np.ndarray, float]:
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 
 
-def without_defects(scan: np.ndarray, defects: np.ndarray, layout_to_scan: np.ndarray) -> np.ndarray:
+def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array:
     """A copy of the scan (ny, nx) with NaN where it shows a defect of the layout's pixels."""
-    rows, columns = warped_grid(np.linalg.inv(layout_to_scan), (scan.shape[0], scan.shape[1]))
+    rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
     inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
-    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
-    return np.where(inside & defects[tuple(nearest)], np.nan, scan)
+    return np.where(inside & nearest(defects, rows, columns), np.nan, scan)
 
 
-def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray | None:
+def _misfit(scan: Array, fine: FineFit) -> Array | None:
     """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing.
 
     None if it shows next to nothing of the layout.
@@ -130,7 +128,7 @@ def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray | None:
     from scipy.ndimage import map_coordinates
 
     topography, found = fine.topography, fine.refinement
-    shape = (topography.shape[0], topography.shape[1])
+    shape = topography.shape
     seen = overlap_of(found.layout_to_scan, shape, np.isfinite(scan), found.bend)
     places = warped_grid(found.layout_to_scan, shape, found.bend)
     warped = np.where(seen, map_coordinates(fill_gaps(scan), places, order=1, mode="nearest"), np.nan)
@@ -149,7 +147,7 @@ def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray | None:
     return framed
 
 
-def _robust(design: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _robust(design: Array, values: Array) -> Array:
     """Coefficients under Tukey's weights, from a start under weights that fall off slowly."""
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])

@@ -1,11 +1,10 @@
 """How well a registration is known: held-out blocks, bootstrap, correlation, information."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.geometry import corners
 from litho_data.register.refine import BORDER_PX, Refinement, corner_motion_px, solve_gram
 from litho_data.register.topography import pearson, smooth_measured
@@ -26,9 +25,9 @@ class BlockShifts:
     for a warp fitted without the block.
     """
 
-    middle_px: np.ndarray
-    shift_px: np.ndarray
-    held_out_px: np.ndarray
+    middle_px: Array
+    shift_px: Array
+    held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
         """Percentiles of the target registration error, NaN without blocks."""
@@ -63,13 +62,13 @@ class BlockShifts:
         rows = [(place, *self.shift_px[places == place].mean(axis=0)) for place in np.unique(places)]
         return "; ".join(f"{(at + 0.5) * pitch_um:.1f}: {x:+.2f} {y:+.2f}" for at, x, y in rows)
 
-    def _by_place(self, axis: int, along: int) -> list[np.ndarray]:
+    def _by_place(self, axis: int, along: int) -> list[Array]:
         places = self.middle_px[:, along]
         return [self.shift_px[places == place, axis] for place in np.unique(places)]
 
 
 def match_blocks_of_field(
-    refinement: Refinement, registered: np.ndarray, measured: np.ndarray, topography: np.ndarray
+    refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
     """The shift of every block, under the warp and under a warp refitted to the pixels outside the block.
 
@@ -84,7 +83,7 @@ def match_blocks_of_field(
     """
     import cv2
 
-    gram, shape = refinement.gram, (topography.shape[0], topography.shape[1])
+    gram, shape = refinement.gram, topography.shape
     size = min(WINDOW_CELLS, gram.shape[0] // 2, gram.shape[1] // 2)
     total, scale = gram.sum(axis=(0, 1)), np.array(shape) / gram.shape[:2]
     image, template = registered.astype(np.float32), topography.astype(np.float32)
@@ -114,7 +113,7 @@ def match_blocks_of_field(
     return BlockShifts(*(np.reshape(values, (-1, 2)) for values in (middles, shifts, held_out)))
 
 
-def bootstrap_corner_sd_px(refinement: Refinement, shape: tuple[int, int], seed: int) -> float:
+def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> float:
     """Largest standard deviation of a corner over bootstrap draws of the field's blocks, px."""
     blocks = refinement.blocks()
     blocks = blocks.reshape(-1, *blocks.shape[2:])
@@ -127,7 +126,7 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: tuple[int, int], seed:
     return float(np.sqrt(motion.var(axis=0).sum(axis=-1)).max())
 
 
-def height_correlation(height: np.ndarray, layout_level: np.ndarray) -> float:
+def height_correlation(height: Array, layout_level: Array) -> float:
     """Pearson correlation of heights, smoothed with sigma = 1 px, with the layout as it is.
 
     Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
@@ -135,10 +134,10 @@ def height_correlation(height: np.ndarray, layout_level: np.ndarray) -> float:
     chosen = _interior(height)
     if chosen.sum() < 16:
         return float("nan")
-    return pearson(smooth_measured(height, 1.0)[chosen], layout_level[chosen].astype(np.float64))
+    return pearson(smooth_measured(height, 1.0)[chosen], layout_level[chosen].astype(float))
 
 
-def mutual_information_bit(height: np.ndarray, layout_level: np.ndarray) -> float:
+def mutual_information_bit(height: Array, layout_level: Array) -> float:
     """Mutual information of height (64 equally filled classes) and level over the same pixels, bit."""
     chosen = _interior(height)
     if chosen.sum() < 16:
@@ -153,17 +152,17 @@ def mutual_information_bit(height: np.ndarray, layout_level: np.ndarray) -> floa
     return float((joint[present] * np.log2(joint[present] / product[present])).sum())
 
 
-def _interior(height: np.ndarray) -> np.ndarray:
+def _interior(height: Array) -> Array:
     chosen = np.zeros(height.shape, bool)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     chosen[inner] = np.isfinite(height[inner])
     return chosen
 
 
-def _peak(score: np.ndarray) -> np.ndarray:
+def _peak(score: Array) -> Array:
     """Sub-pixel position (x, y) of the maximum; a maximum on the border stays where it is."""
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
-    position = np.array([column, row], dtype=np.float64)
+    position = np.array([column, row], dtype=float)
     for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):
         if 0 < k < len(line) - 1:
             before, at, after = (float(value) for value in line[k - 1 : k + 2])

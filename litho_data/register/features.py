@@ -1,12 +1,11 @@
 """Coarse registration without an assumption about position: matched points and a robust affine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform
 from litho_data.register.topography import fill_gaps, predicted_topography, smooth_measured
@@ -32,17 +31,17 @@ class Correspondence:
 
     method: str
     keypoints: int
-    layout_points: np.ndarray
-    scan_points: np.ndarray
-    inlier: np.ndarray
-    layout_to_scan: np.ndarray
+    layout_points: Array
+    scan_points: Array
+    inlier: Array
+    layout_to_scan: Array
     hull_px2: float
 
-    def coverage(self, overlap: np.ndarray) -> float:
+    def coverage(self, overlap: Array) -> float:
         """Area spanned by the inliers as a share of the pixels where scan and layout overlap."""
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
-    def reprojection_px(self, layout_to_scan: np.ndarray, bend: Bend | None = None) -> float:
+    def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
         """Root mean square distance of the inliers from a warp, scan pixels; of a bent scan, straightened."""
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
         found = self.scan_points[self.inlier]
@@ -50,9 +49,7 @@ class Correspondence:
         return float(np.sqrt(((moved - found) ** 2).sum(axis=1).mean()))
 
 
-def match_features(
-    method: str, scan: np.ndarray, layout_level: np.ndarray, seed: int
-) -> Correspondence | None:
+def match_features(method: str, scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
     """Keypoints of both images (ORB or SIFT), cross-checked matches and a MAGSAC affine.
 
     Args:
@@ -93,7 +90,7 @@ def match_features(
     return _robust_affine(method, keypoints, layout_points, scan_points, seed)
 
 
-def match_bits(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def match_bits(first: Array, second: Array) -> tuple[Array, Array]:
     """Cross-checked matches of binary descriptors: those of OpenCV's matcher, in a third of its time.
 
     Args:
@@ -122,9 +119,7 @@ def match_bits(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.nd
     return mutual, nearest[mutual]
 
 
-def match_blocks(
-    scan: np.ndarray, layout_level: np.ndarray, layout_to_scan: np.ndarray, seed: int
-) -> Correspondence | None:
+def match_blocks(scan: Array, layout_level: Array, layout_to_scan: Array, seed: int) -> Correspondence | None:
     """Feature-free fallback: the best shift of every block of the layout near a predicted place.
 
     Args:
@@ -157,7 +152,7 @@ def match_blocks(
     return _robust_affine("blocks", len(layout_points), layout_middles, scan_middles, seed)
 
 
-def _contrast_image(image: np.ndarray) -> np.ndarray:
+def _contrast_image(image: Array) -> Array:
     """8-bit copy with local contrast equalised; used to find keypoints, never for heights."""
     import cv2
 
@@ -169,8 +164,8 @@ def _contrast_image(image: np.ndarray) -> np.ndarray:
 def _robust_affine(
     method: str,
     keypoints: int,
-    layout_points: np.ndarray,
-    scan_points: np.ndarray,
+    layout_points: Array,
+    scan_points: Array,
     seed: int,
 ) -> Correspondence | None:
     import cv2
@@ -191,6 +186,6 @@ def _robust_affine(
     return Correspondence(method, keypoints, layout_points, scan_points, inlier, matrix, hull_px2)
 
 
-def _block_starts(size: int) -> np.ndarray:
+def _block_starts(size: int) -> Array:
     count = max(1, 2 * size // BLOCK_PX - 1)
     return np.unique(np.linspace(0, max(size - BLOCK_PX, 0), count).astype(int))

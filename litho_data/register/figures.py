@@ -1,11 +1,10 @@
 """The figures of one registration, from the fit and the images it compared."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.coarse import CoarseFit
 from litho_data.register.evidence import BlockShifts, bootstrap_corner_sd_px, match_blocks_of_field
 from litho_data.register.geometry import apply_transform, centre, linear_part, overlap_of
@@ -32,15 +31,13 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
         "coverage": float("nan"),
     }
     if points:
-        overlap = overlap_of(warp, _shape(fine.topography), np.isfinite(fine.scan), bend)
+        overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
         figures["coverage"] = points.coverage(overlap)
     figures["reprojection_nm"] = figures["reprojection_px"] * pitch_um * 1e3
     return figures
 
 
-def figures_of_warp(
-    layout_to_scan: np.ndarray, layout_shape: tuple[int, int], pitch_um: float
-) -> dict[str, Any]:
+def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
     """Place, scale and rotation at the layout's middle; of a bent scan, those of the closest affine.
 
     The place: where the middle lies in the scan less where it lies in the layout.
@@ -61,7 +58,7 @@ def figures_of_warp(
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
     """How well the warp is known: held-out blocks, bootstrap, other candidates; and the blocks."""
-    warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
+    warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
     aligned = fine.refinement.warped - background
     measured = overlap_of(warp, shape, np.isfinite(fine.scan), fine.refinement.bend)
@@ -86,7 +83,3 @@ def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict
         "second_orientation": rival_orientation(registered, fine.topography),
     }
     return figures, blocks
-
-
-def _shape(image: np.ndarray) -> tuple[int, int]:
-    return image.shape[0], image.shape[1]

@@ -1,11 +1,11 @@
 """How a warp can change: the generators of every rung of the ladder, and the quadratic flows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
+
+from litho_data.foundation.kinds import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
 # Number of generators of each rung, counted from the first: the ladder is nested by construction.
@@ -21,14 +21,14 @@ GENERATORS[6, 2, 0] = GENERATORS[7, 2, 1] = 1.0
 BENT_COUNT = 12
 
 
-def normalisation(shape: tuple[int, int]) -> np.ndarray:
+def normalisation(shape: Shape) -> Array:
     """Matrix from index coordinates to ones of order one about the middle, same scale for both axes."""
     scale = 2.0 / (max(shape) - 1)
     ny, nx = shape
     return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
 
 
-def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
     """Velocity (along x, along y) of normalised points under a generator; x and y broadcast."""
     coordinates = (x, y, np.ones(1, dtype=x.dtype))
     zero = np.zeros(1, dtype=x.dtype)
@@ -38,7 +38,7 @@ def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarr
     return moved_x - weight * x, moved_y - weight * y
 
 
-def flows(count: int, x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
     """Velocities of the first ``count`` generators; for ``BENT_COUNT`` all affine and quadratic ones."""
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)

@@ -5,10 +5,9 @@ pixel centres 0, 1, 2 …; the micrometre frame of the same image has those cent
 ``(i + 0.5) * pitch_um``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
@@ -25,13 +24,13 @@ ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
 }
 
 
-def index_to_um(pitch_um: tuple[float, float]) -> np.ndarray:
+def index_to_um(pitch_um: YX) -> Array:
     """The matrix that takes pixel indices (x, y) to µm for a (y, x) pitch."""
     pitch_y, pitch_x = pitch_um
     return np.array([[pitch_x, 0.0, pitch_x / 2], [0.0, pitch_y, pitch_y / 2], [0.0, 0.0, 1.0]])
 
 
-def orient(image: np.ndarray, orientation: str) -> np.ndarray:
+def orient(image: Array, orientation: str) -> Array:
     """The image after one of the eight operations of ``ORIENTATIONS`` (a view)."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     turned = image.T if transpose else image
@@ -39,7 +38,7 @@ def orient(image: np.ndarray, orientation: str) -> np.ndarray:
     return turned[:, ::-1] if flip_x else turned
 
 
-def orientation_matrix(orientation: str, shape: tuple[int, int]) -> np.ndarray:
+def orientation_matrix(orientation: str, shape: Shape) -> Array:
     """The matrix from indices of an image of this (y, x) shape to those in ``orient(image, orientation)``."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
@@ -62,7 +61,7 @@ def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
     return int((fast_axis == "y") == transposed)
 
 
-def nearest_orientation(linear: np.ndarray) -> str:
+def nearest_orientation(linear: Array) -> str:
     """The orientation whose linear part is closest (Frobenius norm) to a 2×2 matrix."""
     unit = linear / np.sqrt(abs(np.linalg.det(linear)))
 
@@ -72,21 +71,19 @@ def nearest_orientation(linear: np.ndarray) -> str:
     return min(ORIENTATIONS, key=distance)
 
 
-def apply_transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+def apply_transform(matrix: Array, points: Array) -> Array:
     """Maps (n, 2) points (x, y) by a 3×3 matrix."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
-def warped_grid(
-    matrix: np.ndarray, shape: tuple[int, int], bend: Bend | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
     """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
 
     With a bend of the target image: the points whose true position is where the matrix points.
     """
-    y = np.arange(shape[0], dtype=np.float64)[:, None]
-    x = np.arange(shape[1], dtype=np.float64)[None, :]
+    y = np.arange(shape[0], dtype=float)[:, None]
+    x = np.arange(shape[1], dtype=float)[None, :]
     mapped_x, mapped_y, weight = (row[0] * x + row[1] * y + row[2] for row in matrix)
     if bend is None:
         return mapped_y / weight, mapped_x / weight
@@ -94,31 +91,39 @@ def warped_grid(
 
 
 def overlap_of(
-    layout_to_scan: np.ndarray, layout_shape: tuple[int, int], measured: np.ndarray, bend: Bend | None = None
-) -> np.ndarray:
+    layout_to_scan: Array, layout_shape: Shape, measured: Array, bend: Bend | None = None
+) -> Array:
     """Which layout pixels have their centre inside the measured part of the scan, bool (ny, nx)."""
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
-    if measured.all():
-        return inside
-    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
-    return inside & measured[tuple(nearest)]
+    return inside if measured.all() else inside & nearest(measured, rows, columns)
 
 
-def linear_part(matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
+def nearest(image: Array, rows: Array, columns: Array) -> Array:
+    """The pixels of an image (ny, nx) that lie nearest to these places."""
+    clipped = (np.clip(np.rint(k), 0, n - 1) for k, n in zip((rows, columns), image.shape, strict=True))
+    return image[tuple(k.astype(int) for k in clipped)]
+
+
+def lattice(y: Array, x: Array) -> Array:
+    """The points (x, y) of a grid with these rows and columns, (n, 2), row by row."""
+    return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+
+
+def linear_part(matrix: Array, point: Array) -> Array:
     """The 2×2 Jacobian of the map at a point (x, y): its local scale, rotation and shear."""
     mapped = apply_transform(matrix, point[None])[0]
     weight = matrix[2, :2] @ point + matrix[2, 2]
     return (matrix[:2, :2] - np.outer(mapped, matrix[2, :2])) / weight
 
 
-def corners(shape: tuple[int, int]) -> np.ndarray:
+def corners(shape: Shape) -> Array:
     """Index coordinates (x, y) of the four corner pixels, shape (4, 2)."""
     ny, nx = shape
     return np.array([[0.0, 0], [nx - 1, 0], [0, ny - 1], [nx - 1, ny - 1]])
 
 
-def centre(shape: tuple[int, int]) -> np.ndarray:
+def centre(shape: Shape) -> Array:
     """Index coordinates (x, y) of the middle of an image, shape (2,)."""
     return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])

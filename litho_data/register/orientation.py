@@ -1,20 +1,17 @@
 """Orientation, sign and rough position, by masked normalised cross-correlation over all shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.geometry import ORIENTATIONS, orient
 
 SEARCH_SIZE_PX = 128
 MIN_OVERLAP = 0.4
 TIE = 0.02
-
-_Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -28,12 +25,12 @@ class Hypothesis:
     orientation: str
     polarity: int
     ncc: float
-    layout_to_oriented: np.ndarray
+    layout_to_oriented: Array
 
 
 def search_orientation(
-    scan: np.ndarray,
-    topography: np.ndarray,
+    scan: Array,
+    topography: Array,
     orientations: tuple[str, ...] = tuple(ORIENTATIONS),
     polarities: tuple[int, ...] = (1, -1),
 ) -> list[Hypothesis]:
@@ -61,7 +58,7 @@ def search_orientation(
         handicap = TIE * (1 - overlap / overlap.max())
         # The centre of a block of `factor` pixels is (factor - 1) / 2 after its first pixel; rotating a scan
         # whose size is no multiple of the factor moves the remainder to the other side.
-        cut_y, cut_x = _cut_off(orientation, (scan.shape[0], scan.shape[1]), factor)
+        cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
         for polarity in polarities:
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
             # Shifts run from -(fixed size - 1) to moving size - 1, the negative ones wrapped to the end.
@@ -76,7 +73,7 @@ def search_orientation(
     return sorted(found, key=lambda hypothesis: -hypothesis.ncc)
 
 
-def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
+def rival_alignment(registered: Array, topography: Array) -> float:
     """Correlation of the best rival shift, as a share of that of the registration itself.
 
     A rival is a local maximum of the correlation over shifts, a sixteenth of the field or more away. With
@@ -98,7 +95,7 @@ def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
     return float(max(rivals.max(initial=0.0), 0.0) / own)
 
 
-def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
+def rival_orientation(registered: Array, topography: Array) -> float:
     """Largest correlation of the registered scan after rotation, mirroring or inversion, over all shifts."""
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
@@ -112,7 +109,7 @@ def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
     return float(max(rivals, default=float("nan")))
 
 
-def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
+def reduce_image(image: Array, factor: int) -> Array:
     """Means over blocks of ``factor`` × ``factor`` pixels; no remainder, NaN where half is missing."""
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
@@ -122,9 +119,7 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
     return np.divide(total, count, out=np.full((ny, nx), np.nan), where=2 * count > factor**2)
 
 
-def masked_correlations(
-    fixed: np.ndarray, movings: Sequence[np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def masked_correlations(fixed: Array, movings: Sequence[Array]) -> Iterator[tuple[Array, Array]]:
     """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap, for each.
 
     Yields:
@@ -135,10 +130,10 @@ def masked_correlations(
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     @cache
-    def of_fixed(shape: _Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def of_fixed(shape: Shape) -> tuple[Array, Array, Array]:
         return rfft2(np.isfinite(fixed).astype(float), shape), *_height_spectra(fixed, shape)
 
-    def under(measured: np.ndarray, shape: _Shape) -> tuple[np.ndarray, ...]:
+    def under(measured: Array, shape: Shape) -> tuple[Array, ...]:
         """Pixels of the fixed image under the moving one's: number, sum, energy about the mean."""
         mask = rfft2(measured.astype(float), shape)
         number, total, energy = (irfft2(np.conj(part) * mask, shape) for part in of_fixed(shape))
@@ -146,7 +141,7 @@ def masked_correlations(
         return number, total, energy - total**2 / number
 
     @cache
-    def under_complete(moving_shape: _Shape, shape: _Shape) -> tuple[np.ndarray, ...]:
+    def under_complete(moving_shape: Shape, shape: Shape) -> tuple[Array, ...]:
         return under(np.ones(moving_shape, bool), shape)
 
     for moving in movings:
@@ -169,7 +164,7 @@ def masked_correlations(
         yield np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
 
 
-def _height_spectra(image: np.ndarray, shape: _Shape) -> tuple[np.ndarray, np.ndarray]:
+def _height_spectra(image: Array, shape: Shape) -> tuple[Array, Array]:
     """Transforms of an image's heights, scaled to unit energy and 0 where not measured, and their squares."""
     from scipy.fft import rfft2
 
@@ -180,12 +175,12 @@ def _height_spectra(image: np.ndarray, shape: _Shape) -> tuple[np.ndarray, np.nd
     return rfft2(values, shape), rfft2(values**2, shape)
 
 
-def _cut_off(orientation: str, shape: tuple[int, int], factor: int) -> tuple[int, int]:
+def _cut_off(orientation: str, shape: Shape, factor: int) -> tuple[int, int]:
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
     return (ny % factor if flip_y else 0), (nx % factor if flip_x else 0)
 
 
-def _wrapped(size: int) -> np.ndarray:
+def _wrapped(size: int) -> Array:
     index = np.arange(size)
     return np.minimum(index, size - index)

@@ -1,12 +1,11 @@
 """Refinement from coarse to fine, with the blur of the print matched on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.flows import LADDER, Model
 from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
@@ -30,15 +29,15 @@ class FineFit:
     """The refinement with the two images that were compared: smoothed scan and blur-matched topography."""
 
     refinement: Refinement
-    scan: np.ndarray
-    topography: np.ndarray
+    scan: Array
+    topography: Array
     blur_px: float
 
 
 def refine_pyramid(
-    scan: np.ndarray,
-    layout_level: np.ndarray,
-    start: np.ndarray,
+    scan: Array,
+    layout_level: Array,
+    start: Array,
     model: Model,
     *,
     tolerance_px: float = TOLERANCE_PX,
@@ -55,7 +54,7 @@ def refine_pyramid(
     If the last level does not converge the coarse warp stays, marked as not converged.
     """
     low_model: Model = "affine" if model == "homography" else model
-    coarse = project_to_model(start, low_model, (layout_level.shape[0], layout_level.shape[1]))
+    coarse = project_to_model(start, low_model, layout_level.shape)
     matrix, _ = _from_coarse_to_fine(scan, layout_level, coarse, low_model, None)
     smooth_scan = _smooth(scan, SCAN_BLUR_PX)
     blur_px = match_blur(smooth_scan, layout_level, matrix)
@@ -66,16 +65,16 @@ def refine_pyramid(
     return FineFit(refinement, smooth_scan, topography, blur_px)
 
 
-def refine_bent(scan: np.ndarray, layout_level: np.ndarray, straight: FineFit) -> FineFit:
+def refine_bent(scan: Array, layout_level: Array, straight: FineFit) -> FineFit:
     """Refine the best straight warp again, as an affine and a bend of the scan.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
         straight: what that returned; its error may reach the width of structures at a quarter resolution.
     """
-    shape = (layout_level.shape[0], layout_level.shape[1])
+    shape = layout_level.shape
     matrix = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
-    bend: Bend | None = Bend.none_yet((scan.shape[0], scan.shape[1]))
+    bend: Bend | None = Bend.none_yet(scan.shape)
     matrix, bend = _from_coarse_to_fine(scan, layout_level, matrix, "affine", bend)
     blur_px = match_blur(straight.scan, layout_level, matrix, bend)
     topography = predicted_topography(layout_level, blur_px)
@@ -84,9 +83,7 @@ def refine_bent(scan: np.ndarray, layout_level: np.ndarray, straight: FineFit) -
     return FineFit(refinement, level, topography, blur_px)
 
 
-def _without_own_bow(
-    scan: np.ndarray, topography: np.ndarray, grid: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
+def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
     """The scan minus the quadratic surface that the topography does not explain.
 
     A surface that is quadratic in the scan's frame, including the print's share of it, is not quadratic in
@@ -94,7 +91,7 @@ def _without_own_bow(
     """
     from scipy.ndimage import map_coordinates
 
-    basis = quadratic_basis((scan.shape[0], scan.shape[1]))
+    basis = quadratic_basis(scan.shape)
     places = tuple(one[::3, ::3] for one in grid)
     warped = map_coordinates(fill_gaps(scan), places, order=1, cval=np.nan)
     seen = np.isfinite(warped)
@@ -105,8 +102,8 @@ def _without_own_bow(
 
 
 def _from_coarse_to_fine(
-    scan: np.ndarray, layout_level: np.ndarray, matrix: np.ndarray, model: Model, bend: Bend | None
-) -> tuple[np.ndarray, Bend | None]:
+    scan: Array, layout_level: Array, matrix: Array, model: Model, bend: Bend | None
+) -> tuple[Array, Bend | None]:
     """Warp and bend, refined at a quarter and at half resolution."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
@@ -124,9 +121,7 @@ def _from_coarse_to_fine(
     return matrix, bend
 
 
-def reduced_levels(
-    scan: np.ndarray, layout_level: np.ndarray
-) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
     """Factor, scan and predicted topography at a quarter and at half resolution, where enough is left."""
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
@@ -137,12 +132,12 @@ def reduced_levels(
 
 
 def match_blur(
-    smooth_scan: np.ndarray, layout_level: np.ndarray, layout_to_scan: np.ndarray, bend: Bend | None = None
+    smooth_scan: Array, layout_level: Array, layout_to_scan: Array, bend: Bend | None = None
 ) -> float:
     """The Gaussian sigma, layout pixels, whose topography correlates best with an aligned scan."""
     from scipy.ndimage import map_coordinates
 
-    grid = warped_grid(layout_to_scan, (layout_level.shape[0], layout_level.shape[1]), bend)
+    grid = warped_grid(layout_to_scan, layout_level.shape, bend)
     # Every other pixel is enough to rank blurs of half a pixel and more.
     rows, columns = grid[0][::2, ::2], grid[1][::2, ::2]
     warped = map_coordinates(fill_gaps(smooth_scan), (rows, columns), order=1, cval=np.nan)
@@ -158,7 +153,7 @@ def match_blur(
     return BLURS_PX[int(np.argmax(scores))]
 
 
-def project_to_model(matrix: np.ndarray, model: Model, shape: tuple[int, int]) -> np.ndarray:
+def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """The warp of a lower rung that moves the corners of the field most like a given warp."""
     if LADDER[model] >= LADDER["affine"]:
         if model == "homography":
@@ -178,7 +173,7 @@ def project_to_model(matrix: np.ndarray, model: Model, shape: tuple[int, int]) -
     return _about(linear, points.mean(0), moved.mean(0))
 
 
-def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarray:
+def _about(linear: Array, point: Array, image: Array) -> Array:
     """The affine with a given linear part that takes one point to its image."""
     matrix = np.eye(3)
     matrix[:2, :2] = linear
@@ -186,7 +181,7 @@ def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarr
     return matrix
 
 
-def _smooth(scan: np.ndarray, sigma_px: float) -> np.ndarray:
+def _smooth(scan: Array, sigma_px: float) -> Array:
     """Smoothed where measured: what fills a gap comes from its surroundings and is no evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)
 
@@ -203,7 +198,7 @@ def climb(fine: FineFit) -> FineFit:
     A higher rung is better if its gain on held-out blocks, averaged over the blocks, exceeds three standard
     errors.
     """
-    shape = (fine.topography.shape[0], fine.topography.shape[1])
+    shape = fine.topography.shape
     start = fine.refinement.layout_to_scan
     fits = [
         refine(fine.scan, fine.topography, project_to_model(start, model, shape), model) for model in LADDER
@@ -215,7 +210,7 @@ def climb(fine: FineFit) -> FineFit:
     return replace(fine, refinement=fits[rung])
 
 
-def held_out_energy(refinement: Refinement) -> np.ndarray:
+def held_out_energy(refinement: Refinement) -> Array:
     """Residual energy of every block under the fit to the blocks of the other folds, (n,).
 
     The folds interleave, so each is spread over the whole field.
@@ -229,6 +224,6 @@ def held_out_energy(refinement: Refinement) -> np.ndarray:
     return energy.ravel()
 
 
-def _pays(low: np.ndarray, high: np.ndarray) -> bool:
+def _pays(low: Array, high: Array) -> bool:
     gain = low - high
     return float(gain.mean()) > STANDARD_ERRORS * float(gain.std(ddof=1)) / np.sqrt(len(gain))

@@ -1,7 +1,5 @@
 """What is recorded about one registration, and when it counts as passed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -91,70 +89,54 @@ def judge(
         blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
         bend_um: of the scan, in its own frame, if one was fitted.
     """
-    low, high = thresholds.singular_range
     smallest, largest = figures["singular_min"], figures["singular_max"]
-    margin = figures["ecc"] - figures["second_orientation"]
+    scale = f"scale {smallest:.3f} to {largest:.3f}"
+    ecc, tre_px, repeats = figures["ecc"], figures["tre_median_px"], figures["layout_repeats"]
+    margin, second = ecc - figures["second_orientation"], figures["second_alignment"]
     upright = figures["dihedral"] == "identity" and figures["polarity"] == 1
-    tied = margin < thresholds.min_orientation_margin
-    by_points = figures["method"] in ("orb", "sift")
     softness = max(1.0, blur_px / thresholds.blur_of_limits_px)
-
-    fits = figures["ecc"] >= thresholds.min_ecc
-    failures = []
-    if not fits:
-        failures.append(f"correlation {figures['ecc']:.2f}, at least {thresholds.min_ecc} wanted")
-    if figures["layout_repeats"] > thresholds.max_layout_repeats:
-        share = figures["layout_repeats"]
-        failures.append(f"ambiguous: the layout repeats itself, correlation {share:.2f} with its own shift")
-    elif fits and figures["second_alignment"] > thresholds.max_second_alignment:
-        share = figures["second_alignment"]
-        failures.append(f"ambiguous: another shift correlates {share:.2f} times as well")
-    if fits and tied and not upright:
-        failures.append(f"ambiguous: another orientation or polarity correlates within {margin:.2f}")
+    overlap, spread_px, defects = figures["overlap"], figures["corner_sd_px"], figures["defect_share"]
+    fits, repeating = ecc >= thresholds.min_ecc, repeats > thresholds.max_layout_repeats
+    tied = fits and margin < thresholds.min_orientation_margin
+    low, high = thresholds.singular_range
+    warning_low, warning_high = thresholds.singular_warning_range
+    bent_um = 0.0 if bend_um is None else bend_um.largest
+    how = "registered with a quadratic distortion"
+    if bend_um is not None and bend_um.kind == "creep":
+        how = "its lines creep along the slow axis, and are put back"
     # Written as "not >=", so that a figure that could not be computed fails.
-    if not figures["overlap"] >= thresholds.min_overlap:
-        failures.append(f"overlap {figures['overlap']:.2f}, at least {thresholds.min_overlap} wanted")
-    if not low <= smallest <= largest <= high:
-        failures.append(f"scale {smallest:.3f} to {largest:.3f}, {low} to {high} wanted; is the pitch right?")
-    if figures["tre_median_px"] > softness * thresholds.max_tre_median_px:
-        failures.append(f"target registration error {figures['tre_median_px']:.2f} px")
-    if not figures["corner_sd_px"] <= softness * thresholds.max_corner_sd_px:
-        spread = figures["corner_sd_px"]
-        failures.append(
-            f"corners known to {spread:.2f} px only" if spread == spread else "corners not determined"
-        )
-
-    if bend_um is not None and not bend_um.slope < thresholds.max_bend_slope:
-        failures.append(f"bent by up to {bend_um.largest:.2f} µm, which may fold the scan")
-
-    warnings = []
-    if bend_um is not None:
-        size = f"{bend_um.largest:.2f} µm"
-        how = "registered with a quadratic distortion"
-        if bend_um.kind == "creep":
-            how = "its lines creep along the slow axis, and are put back"
-        warnings.append(f"scan bent by up to {size}: {how}")
-    if figures["defect_share"] > 0:
-        share = figures["defect_share"]
-        warnings.append(f"{share:.1%} of the field shows something else than the print and is left out")
-    low, high = thresholds.singular_warning_range
-    if not low <= smallest <= largest <= high:
-        warnings.append(f"scale {smallest:.3f} to {largest:.3f}; is the pitch right?")
-    if fits and tied and upright:
-        warnings.append("layout looks alike in another orientation; upright assumed")
-    if figures["tre_median_px"] > thresholds.tre_median_warning_px:
-        warnings.append(f"target registration error {figures['tre_median_px']:.2f} px")
-    if figures["polarity"] == -1:
-        warnings.append("inverted contrast")
-    if not by_points:
-        warnings.append(f"coarse fit by {figures['method']}, no feature matches")
-    if not figures["converged"]:
-        warnings.append("refinement did not converge")
-    return not failures, "; ".join(failures), "; ".join(warnings)
+    failures = {
+        f"correlation {ecc:.2f}, at least {thresholds.min_ecc} wanted": not fits,
+        f"ambiguous: the layout repeats itself, correlation {repeats:.2f} with its own shift": repeating,
+        f"ambiguous: another shift correlates {second:.2f} times as well": fits
+        and not repeating
+        and second > thresholds.max_second_alignment,
+        f"ambiguous: another orientation or polarity correlates within {margin:.2f}": tied and not upright,
+        f"overlap {overlap:.2f}, at least {thresholds.min_overlap} wanted": not overlap
+        >= thresholds.min_overlap,
+        f"{scale}, {low} to {high} wanted; is the pitch right?": not low <= smallest <= largest <= high,
+        f"target registration error {tre_px:.2f} px": tre_px > softness * thresholds.max_tre_median_px,
+        "corners not determined": spread_px != spread_px,
+        f"corners known to {spread_px:.2f} px only": spread_px > softness * thresholds.max_corner_sd_px,
+        f"bent by up to {bent_um:.2f} µm, which may fold the scan": bend_um is not None
+        and not bend_um.slope < thresholds.max_bend_slope,
+    }
+    warnings = {
+        f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
+        f"{defects:.1%} of the field shows something else than the print and is left out": defects > 0,
+        f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
+        "layout looks alike in another orientation; upright assumed": tied and upright,
+        f"target registration error {tre_px:.2f} px": tre_px > thresholds.tre_median_warning_px,
+        "inverted contrast": figures["polarity"] == -1,
+        f"coarse fit by {figures['method']}, no feature matches": figures["method"] not in ("orb", "sift"),
+        "refinement did not converge": not figures["converged"],
+    }
+    reasons, said = ("; ".join(text for text, so in one.items() if so) for one in (failures, warnings))
+    return not reasons, reasons, said
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
     """The record of a scan for which nothing could be fitted: every figure is missing."""
-    empty = {"int": 0, "float": float("nan"), "str": "none", "bool": False}
-    figures = {field.name: empty[str(field.type)] for field in fields(RegistrationQuality)}
-    return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})  # type: ignore[arg-type]
+    empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
+    figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
+    return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

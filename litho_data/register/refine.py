@@ -6,17 +6,16 @@ G. D. Evangelidis, E. Z. Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.
 S. Baker, I. Matthews, IJCV 56 (2004), doi:10.1023/B:VISI.0000011205.11775.fd.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
-from litho_data.register.geometry import apply_transform, corners, warped_grid
+from litho_data.register.geometry import apply_transform, corners, lattice, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
@@ -40,18 +39,18 @@ class Refinement:
     """
 
     model: Model
-    layout_to_scan: np.ndarray
-    warped: np.ndarray
-    gram: np.ndarray
+    layout_to_scan: Array
+    warped: Array
+    gram: Array
     converged: bool
     bend: Bend | None = None
 
-    def blocks(self) -> np.ndarray:
+    def blocks(self) -> Array:
         """``gram`` summed over blocks, see ``in_blocks``."""
         return in_blocks(self.gram)
 
     @property
-    def background(self) -> np.ndarray:
+    def background(self) -> Array:
         """Coefficients (6,) of the quadratic surface fitted along with the warp."""
         return solve_gram(self.gram.sum(axis=(0, 1)))[1:NUISANCES]
 
@@ -68,9 +67,9 @@ class Refinement:
 
 
 def refine(
-    scan: np.ndarray,
-    topography: np.ndarray,
-    start: np.ndarray,
+    scan: Array,
+    topography: Array,
+    start: Array,
     model: Model,
     *,
     bend: Bend | None = None,
@@ -90,15 +89,15 @@ def refine(
     from scipy.linalg import expm
     from scipy.ndimage import map_coordinates, spline_filter
 
-    shape = (topography.shape[0], topography.shape[1])
+    shape = topography.shape
     normalise = normalisation(shape)
     denormalise = np.linalg.inv(normalise)
     regressors = _regressors(topography, LADDER[model] if bend is None else BENT_COUNT)
-    interior = _interior(shape)
+    interior = interior_of(shape)
     measured = np.isfinite(scan)
     complete = bool(measured.all())
     spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
-    matrix, converged, step_px = np.array(start, dtype=np.float64), False, np.inf
+    matrix, converged, step_px = np.array(start, dtype=float), False, np.inf
     sums = _Sums(regressors)
     for iteration in range(max_iterations + 1):
         rows, columns = warped_grid(matrix, shape, bend)
@@ -136,21 +135,19 @@ def refine(
     return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
 
 
-def aligned_gram(
-    aligned: np.ndarray, topography: np.ndarray, count: int, further: Sequence[np.ndarray] = ()
-) -> np.ndarray:
+def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
     """``gram`` of a scan that lies on the topography (ny, nx) already, NaN where not measured.
 
     ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further`` regressors (ny, nx)
     stand behind these.
     """
-    shape = (topography.shape[0], topography.shape[1])
-    inside = _interior(shape) & np.isfinite(aligned)
+    shape = topography.shape
+    inside = interior_of(shape) & np.isfinite(aligned)
     regressors = np.concatenate([_regressors(topography, count), *(one[None] for one in further)])
     return _cell_grams(regressors, np.where(inside, aligned, 0.0).astype(np.float32), inside)
 
 
-def in_blocks(gram: np.ndarray) -> np.ndarray:
+def in_blocks(gram: Array) -> Array:
     """Inner products per cell summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
 
     Errors of the topography extend over a feature or two; a block is the smallest independent piece.
@@ -159,7 +156,7 @@ def in_blocks(gram: np.ndarray) -> np.ndarray:
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
 
 
-def solve_gram(gram: np.ndarray) -> np.ndarray:
+def solve_gram(gram: Array) -> Array:
     """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
@@ -168,13 +165,13 @@ def solve_gram(gram: np.ndarray) -> np.ndarray:
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
 
-def residual_energy(gram: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def residual_energy(gram: Array, coefficients: Array) -> Array:
     """Sum of squared residuals of given coefficients over the pixels behind inner products (…, k, k)."""
     extended = np.concatenate([coefficients, -np.ones((*coefficients.shape[:-1], 1))], axis=-1)
     return np.einsum("...i,...ij,...j->...", extended, gram, extended)
 
 
-def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
+def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
     """Displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
 
     Not finite where the fitted gain of the topography is 0.
@@ -187,21 +184,20 @@ def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: n
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
 
 
-def _interior(shape: tuple[int, int]) -> np.ndarray:
-    border = min(BORDER_PX, min(shape) // 16)
+def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
+    """Pixels (ny, nx) away from the border, bool."""
+    border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
-def _moved_on(
-    matrix: np.ndarray, bend: Bend, coefficients: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, Bend]:
+def _moved_on(matrix: Array, bend: Bend, coefficients: Array, shape: Shape) -> tuple[Array, Bend]:
     """The warp after a step, again as an affine and a bend: higher orders vanish with the step.
 
     Raises:
         numpy.linalg.LinAlgError: the positions in and around the scan do not determine them.
     """
     y, x = (np.linspace(0, n - 1, 17) for n in shape)
-    layout = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+    layout = lattice(y, x)
     scan = np.stack(bend.undo(*apply_transform(matrix, layout).T), axis=1)
     reached = (np.abs(scan - bend.middle) < 2 * bend.half).all(axis=1)
     moved = layout + corner_motion_px(coefficients, shape, layout)
@@ -209,9 +205,9 @@ def _moved_on(
     return np.linalg.inv(to_layout), bend
 
 
-def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
+def _regressors(topography: Array, count: int) -> Array:
     """(7 + count, ny, nx): topography, quadratic background, change of the topography per generator."""
-    shape = (topography.shape[0], topography.shape[1])
+    shape = topography.shape
     scale = normalisation(shape)[0, 0]
     gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
     y = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * scale).astype(np.float32)[:, None]
@@ -227,21 +223,21 @@ def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
 class _Sums:
     """Inner products over the whole field; those of the regressors are reused for an equal overlap."""
 
-    def __init__(self, regressors: np.ndarray):
+    def __init__(self, regressors: Array):
         self._regressors = regressors
         self._inside = np.zeros(0, bool)
 
-    def gram(self, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    def gram(self, warped: Array, inside: Array) -> Array:
         """The products (k, k) of regressors and scan over the pixels inside."""
         if not np.array_equal(inside, self._inside):
-            self._inside, self._chosen = inside, self._regressors[:, inside].astype(np.float64)
+            self._inside, self._chosen = inside, self._regressors[:, inside].astype(float)
             self._normal = self._chosen @ self._chosen.T
-        scan = warped[inside].astype(np.float64)
+        scan = warped[inside].astype(float)
         right = self._chosen @ scan
         return np.block([[self._normal, right[:, None]], [right[None, :], scan @ scan]])
 
 
-def _cell_grams(regressors: np.ndarray, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:
     ny, nx = warped.shape
     stack = np.concatenate([regressors, warped[None]])
     stack *= inside
@@ -250,10 +246,10 @@ def _cell_grams(regressors: np.ndarray, warped: np.ndarray, inside: np.ndarray) 
     for i, (top, bottom) in enumerate(pairwise(rows)):
         for j, (left, right) in enumerate(pairwise(columns)):
             # float64 sums: the result must not depend on how BLAS orders them.
-            cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(np.float64)
+            cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(float)
             gram[i, j] = cell @ cell.T
     return gram
 
 
-def _cell_edges(size: int) -> np.ndarray:
+def _cell_edges(size: int) -> Array:
     return np.linspace(0, size, max(1, round(size / CELL_PX)) + 1).astype(int)

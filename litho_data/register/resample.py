@@ -1,12 +1,11 @@
 """The single resampling between a scan and the dataset: float heights, gaps kept."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
@@ -18,14 +17,14 @@ _LAGS = np.arange(-128, 129)
 
 
 def resample_to_layout(
-    height_um: np.ndarray,
-    scan_to_layout: np.ndarray,
-    layout_shape: tuple[int, int],
+    height_um: Array,
+    scan_to_layout: Array,
+    layout_shape: Shape,
     *,
-    scan_pitch_um: tuple[float, float],
+    scan_pitch_um: YX,
     layout_pitch_um: float,
     bend_um: Bend | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """Heights of a scan at the pixel centres of the layout, in one cubic-spline interpolation.
 
     Args:
@@ -54,10 +53,10 @@ def resample_to_layout(
 class Resampler:
     """`resample_to_layout` for several transforms of one scan; the spline is fitted once."""
 
-    def __init__(self, height_um: np.ndarray, *, scan_pitch_um: tuple[float, float], layout_pitch_um: float):
+    def __init__(self, height_um: Array, *, scan_pitch_um: YX, layout_pitch_um: float):
         from scipy.ndimage import spline_filter
 
-        height = np.asarray(height_um, dtype=np.float64)
+        height = np.asarray(height_um, dtype=float)
         self._measured = np.isfinite(height)
         if not self._measured.any():
             raise InputError("scan", got="no measured pixel", wanted="finite heights")
@@ -68,12 +67,12 @@ class Resampler:
         self._spline = spline_filter(filled, SPLINE_ORDER, mode="mirror")
 
     def at(
-        self, scan_to_layout: np.ndarray, layout_shape: tuple[int, int], bend_um: Bend | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, scan_to_layout: Array, layout_shape: Shape, bend_um: Bend | None = None
+    ) -> tuple[Array, Array]:
         """Height and validity under a transform (of the straightened scan), on a layout of this shape."""
         from scipy.ndimage import binary_dilation, map_coordinates
 
-        matrix = np.asarray(scan_to_layout, dtype=np.float64)
+        matrix = np.asarray(scan_to_layout, dtype=float)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
             raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
         to_scan = self._um_to_index @ np.linalg.inv(matrix) @ self._layout_to_um
@@ -89,7 +88,7 @@ class Resampler:
         return np.where(valid, values, np.nan).astype(np.float32), valid
 
 
-def noise_variance_factor(scan_pitch_um: tuple[float, float], layout_pitch_um: float) -> float:
+def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
     """Share of the variance of white pixel noise left by resampling, averaged over sub-pixel positions."""
     along_y, along_x = (line_variance_factor(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um)
     return along_y * along_x
@@ -101,7 +100,7 @@ def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
 
 
 @lru_cache
-def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[np.ndarray, np.ndarray]:
+def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
     """Frequencies (n,), cycles/µm, up to Nyquist's, and the squared error that resampling makes of a wave.
 
     Relative to the square of its amplitude, averaged over sub-pixel positions; the average over the layout's
@@ -116,7 +115,7 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[np.ndarray,
 
 
 @lru_cache
-def _weights(pitch_um: float, layout_pitch_um: float) -> np.ndarray:
+def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
     """What scan pixels at a distance of lag + phase pixels weigh in one of the layout, (phases, lags)."""
     from scipy.ndimage import map_coordinates
 
@@ -127,9 +126,7 @@ def _weights(pitch_um: float, layout_pitch_um: float) -> np.ndarray:
     return map_coordinates(response, [256 + _LAGS[None, :] + _PHASES[:, None]], order=SPLINE_ORDER)
 
 
-def _average_over_layout_pixel(
-    height: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
-) -> np.ndarray:
+def _average_over_layout_pixel(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
     from scipy.ndimage import gaussian_filter
 
     sigma_px = [_average_px(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um]

@@ -1,13 +1,12 @@
 """Registration of one scan onto the layout it was printed from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
 from litho_data.register.creep import refine_with_creep
@@ -15,7 +14,14 @@ from litho_data.register.defects import refine_around_defects, without_defects
 from litho_data.register.evidence import BlockShifts, height_correlation, mutual_information_bit
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
 from litho_data.register.flows import Model
-from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix, slow_axis
+from litho_data.register.geometry import (
+    apply_transform,
+    index_to_um,
+    lattice,
+    orient,
+    orientation_matrix,
+    slow_axis,
+)
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.pyramid import FineFit, climb, refine_bent, refine_pyramid
 from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
@@ -48,18 +54,18 @@ class Registration:
     (dust, collapsed or lifted parts); None if that is nowhere.
     """
 
-    scan_to_layout: np.ndarray
+    scan_to_layout: Array
     quality: RegistrationQuality
     bend_um: Bend | None = None
-    defects: np.ndarray | None = None
+    defects: Array | None = None
 
 
 def register_scan(
-    scan: Scan | np.ndarray,
-    layout_level: np.ndarray,
+    scan: Scan | Array,
+    layout_level: Array,
     *,
     layout_pitch_um: float,
-    scan_pitch_um: tuple[float, float] | None = None,
+    scan_pitch_um: YX | None = None,
     model: Model | Literal["ladder"] = "affine",
     orientation: Literal["search", "identity"] = "search",
     thresholds: Thresholds | None = None,
@@ -87,7 +93,7 @@ def register_scan(
         scan_pitch_um, fast_axis, scan = scan.require_pitch(), scan.fast_axis or fast_axis, scan.height_um
     if scan_pitch_um is None:
         raise InputError("registration of plain heights", got="no scan_pitch_um", wanted="(y, x) in µm")
-    height = np.asarray(scan, dtype=np.float64)
+    height = np.asarray(scan, dtype=float)
     layout = np.asarray(layout_level)
     _check(height, layout, scan_pitch_um, layout_pitch_um)
     centred = centred_placement(height.shape, scan_pitch_um, layout.shape, layout_pitch_um)
@@ -144,15 +150,15 @@ def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
 class _Case:
     """One scan and its layout, with what is needed to judge a warp between them."""
 
-    height_um: np.ndarray
-    layout: np.ndarray
-    scan_pitch_um: tuple[float, float]
+    height_um: Array
+    layout: Array
+    scan_pitch_um: YX
     layout_pitch_um: float
-    centred: np.ndarray
+    centred: Array
     layout_repeats: float
     limits: Thresholds
     seed: int
-    defects: np.ndarray | None
+    defects: Array | None
     slow: int
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
@@ -161,14 +167,14 @@ class _Case:
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
         resampler = Resampler(height, scan_pitch_um=self.scan_pitch_um, layout_pitch_um=pitch_um)
-        before, _ = resampler.at(self.centred, _shape(layout))
-        after, _ = resampler.at(scan_to_layout, _shape(layout), bend_um)
+        before, _ = resampler.at(self.centred, layout.shape)
+        after, _ = resampler.at(scan_to_layout, layout.shape, bend_um)
         if self.defects is not None:
             after = np.where(self.defects, np.nan, after)
         evidence, blocks = figures_of_evidence(fine, pitch_um, self.seed)
         figures = {
             **figures_of_fit(coarse, fine, pitch_um),
-            **figures_of_warp(layout_to_scan, _shape(layout), pitch_um),
+            **figures_of_warp(layout_to_scan, layout.shape, pitch_um),
             **evidence,
             "shift_by_line_px": blocks.by_line(self.slow, pitch_um),
             "layout_repeats": self.layout_repeats,
@@ -184,7 +190,7 @@ class _Case:
         quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
-    def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[np.ndarray, Bend | None]:
+    def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[Array, Bend | None]:
         """The layout's µm to the (straightened) scan's, and the bend in the scan's own frame."""
         frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
         ny, nx = self.height_um.shape
@@ -195,8 +201,7 @@ class _Case:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
         # Turned by 90° a bend is again one: points and their images determine it.
-        u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, 9)] * 2))
-        points_um = np.stack([u, v], axis=1) * size_um
+        points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
         images_um = apply_transform(to_layout, found.bend.straighten(oriented))
@@ -209,11 +214,11 @@ class _Case:
 
 
 def centred_placement(
-    scan_shape: tuple[int, ...],
-    scan_pitch_um: tuple[float, float],
-    layout_shape: tuple[int, ...],
+    scan_shape: Shape,
+    scan_pitch_um: YX,
+    layout_shape: Shape,
     layout_pitch_um: float,
-) -> np.ndarray:
+) -> Array:
     """The ``scan_to_layout`` that puts the middle of the scan on the middle of the layout."""
     matrix = np.eye(3)
     matrix[0, 2] = (layout_shape[1] * layout_pitch_um - scan_shape[1] * scan_pitch_um[1]) / 2
@@ -221,9 +226,7 @@ def centred_placement(
     return matrix
 
 
-def _check(
-    height: np.ndarray, layout: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
-) -> None:
+def _check(height: Array, layout: Array, scan_pitch_um: YX, layout_pitch_um: float) -> None:
     for name, image in (("scan", height), ("layout", layout)):
         if image.ndim != 2 or min(image.shape) < MIN_SIZE_PX:
             wanted = f"(ny, nx) of at least {MIN_SIZE_PX} pixels each"
@@ -232,9 +235,7 @@ def _check(
         raise InputError("pitch", got=(scan_pitch_um, layout_pitch_um), wanted="positive numbers in µm")
 
 
-def at_layout_pitch(
-    height: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
-) -> np.ndarray:
+def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
     """A copy for comparison; the heights that are kept are resampled once, from the original."""
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
@@ -242,25 +243,19 @@ def at_layout_pitch(
     resampled, _ = resample_to_layout(
         height, np.eye(3), shape, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um
     )
-    return resampled.astype(np.float64)
+    return resampled.astype(float)
 
 
-def _shape_at(
-    layout_pitch_um: float, scan_shape: tuple[int, ...], scan_pitch_um: tuple[float, float]
-) -> tuple[int, int]:
+def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> tuple[int, int]:
     """Size of a scan at the layout's pitch, whole pixels."""
     ny, nx = (max(1, round(n * p / layout_pitch_um)) for n, p in zip(scan_shape, scan_pitch_um, strict=True))
     return ny, nx
 
 
-def _rounded(matrix: np.ndarray) -> np.ndarray:
+def _rounded(matrix: Array) -> Array:
     """The matrix without digits far below physical meaning, which could differ between machines."""
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)
     rounded[2, :2] = np.round(matrix[2, :2], 10)
     return rounded + 0.0  # no negative zeros
-
-
-def _shape(image: np.ndarray) -> tuple[int, int]:
-    return image.shape[0], image.shape[1]

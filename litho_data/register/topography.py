@@ -1,13 +1,13 @@
 """Images that can be compared: the topography that a layout predicts, and a scan without gaps and bow."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 
-def predicted_topography(layout_level: np.ndarray, blur_px: float) -> np.ndarray:
+
+def predicted_topography(layout_level: Array, blur_px: float) -> Array:
     """The layout as the printer would render it to first order: levels blurred by a Gaussian.
 
     Args:
@@ -22,7 +22,7 @@ def predicted_topography(layout_level: np.ndarray, blur_px: float) -> np.ndarray
     return gaussian_filter(layout_level.astype(np.float32), blur_px, mode="nearest", truncate=3.0)
 
 
-def smooth_measured(height: np.ndarray, sigma_px: float) -> np.ndarray:
+def smooth_measured(height: Array, sigma_px: float) -> Array:
     """Gaussian smoothing by normalised convolution: gaps neither pull the mean nor spread.
 
     Args:
@@ -37,14 +37,14 @@ def smooth_measured(height: np.ndarray, sigma_px: float) -> np.ndarray:
 
     measured = np.isfinite(height)
     if measured.all():
-        return gaussian_filter(height.astype(np.float64), sigma_px)
-    weight = gaussian_filter(measured.astype(np.float64), sigma_px)
-    total = gaussian_filter(np.where(measured, height, 0.0).astype(np.float64), sigma_px)
+        return gaussian_filter(height.astype(float), sigma_px)
+    weight = gaussian_filter(measured.astype(float), sigma_px)
+    total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
     # 1e-9 separates pixels that see a few distant measured ones from those that see only rounding.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
-def fill_gaps(height: np.ndarray) -> np.ndarray:
+def fill_gaps(height: Array) -> Array:
     """The heights with every NaN replaced: extrapolated for three pixels, then constant.
 
     A gap's first pixels are the point reflection of the measured side about the nearest measured pixel, so
@@ -65,9 +65,9 @@ def fill_gaps(height: np.ndarray) -> np.ndarray:
     return held
 
 
-def remove_bow(height: np.ndarray) -> np.ndarray:
+def remove_bow(height: Array) -> Array:
     """The heights minus their least-squares quadratic surface; only used on copies for comparison."""
-    basis = quadratic_basis((height.shape[0], height.shape[1]))
+    basis = quadratic_basis(height.shape)
     measured = np.isfinite(height)
     # A third of the rows and columns determines six coefficients as well as all of them.
     sparse = np.zeros_like(measured)
@@ -78,7 +78,7 @@ def remove_bow(height: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=4)
-def quadratic_basis(shape: tuple[int, int]) -> np.ndarray:
+def quadratic_basis(shape: Shape) -> Array:
     """1, x, y, x², xy, y² over an image in coordinates from -1 to 1, read-only (6, ny, nx)."""
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
@@ -88,11 +88,11 @@ def quadratic_basis(shape: tuple[int, int]) -> np.ndarray:
     return basis
 
 
-def pearson(a: np.ndarray, b: np.ndarray) -> float:
+def pearson(a: Array, b: Array) -> float:
     """Pearson correlation of two equally long vectors, 0 if one is constant.
 
     Plain sums instead of a matrix product: the same digits whatever the number of BLAS threads.
     """
-    a, b = (values - values.mean(dtype=np.float64) for values in (a, b))
+    a, b = (values - values.mean(dtype=float) for values in (a, b))
     energy = float((a * a).sum()) * float((b * b).sum())
     return float((a * b).sum()) / energy**0.5 if energy > 0 else 0.0

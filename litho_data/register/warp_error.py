@@ -4,13 +4,12 @@ Gain, quadratic surface and warp are fitted again without each block of the fiel
 spread of the fits contains what the topography does not explain, as far as blocks differ in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.flows import BENT_COUNT, LADDER, flows, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
@@ -41,7 +40,7 @@ class WarpError:
         is_clear: whether there is such a surface.
     """
 
-    covariance: np.ndarray
+    covariance: Array
     surface_rms: float
     surface_error_rms: float
     is_clear: bool
@@ -57,9 +56,9 @@ class WarpError:
             return self.surface_rms**2 + self.surface_error_rms**2
         return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
-    def warp_variance(self, height: np.ndarray) -> np.ndarray:
+    def warp_variance(self, height: Array) -> Array:
         """Variance of registered heights (ny, nx) by the error of the warp: steep places move most."""
-        shape = (height.shape[0], height.shape[1])
+        shape = height.shape
         normalise = normalisation(shape)
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
         x = normalise[0, 0] * np.arange(shape[1])[None, :] + normalise[0, 2]
@@ -71,11 +70,11 @@ class WarpError:
             ]
         )
         sizes, directions = np.linalg.eigh(self.covariance)
-        total: np.ndarray = np.maximum(sizes, 0.0) @ (directions.T @ moved) ** 2
+        total: Array = np.maximum(sizes, 0.0) @ (directions.T @ moved) ** 2
         return total.reshape(shape)
 
 
-def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, model: str) -> WarpError:
+def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
     """The errors of a registration, and the surface beside the print.
 
     Args:
@@ -84,7 +83,7 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
         blur_px: Gaussian sigma of the topography, layout pixels.
         model: as in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
     """
-    shape = (height.shape[0], height.shape[1])
+    shape = height.shape
     smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
     count = {str(name): number for name, number in LADDER.items()}.get(model, BENT_COUNT)
     topography = predicted_topography(layout_level, blur_px)
@@ -110,7 +109,7 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
     )
 
 
-def _around(topography: np.ndarray, reach_px: float) -> np.ndarray:
+def _around(topography: Array, reach_px: float) -> Array:
     """Gaussian mean of what surrounds each place, reflected at the border."""
     import cv2
 
@@ -119,15 +118,15 @@ def _around(topography: np.ndarray, reach_px: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=4)
-def _products(shape: tuple[int, int]) -> np.ndarray:
+def _products(shape: Shape) -> Array:
     """Covariances (5, 5) of the terms of a quadratic surface over the field."""
     return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
 
 
-def _without_each(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _without_each(blocks: Array) -> tuple[Array, Array]:
     """Mean and jackknife covariance of the coefficients, from inner products (blocks, k, k)."""
     without = solve_gram(blocks.sum(axis=0) - blocks)
     without[:, NUISANCES:] /= without[:, :1]
     middle = without.mean(axis=0)
-    spread: np.ndarray = (len(blocks) - 1) / len(blocks) * (without - middle).T @ (without - middle)
+    spread: Array = (len(blocks) - 1) / len(blocks) * (without - middle).T @ (without - middle)
     return middle, spread

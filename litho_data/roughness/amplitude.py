@@ -1,11 +1,10 @@
 """Amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.fft
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
@@ -30,7 +29,7 @@ class AmplitudeParameters(Record):
     pixels: int
 
 
-def amplitude_parameters(height_um: np.ndarray, valid: np.ndarray | None = None) -> AmplitudeParameters:
+def amplitude_parameters(height_um: Array, valid: Array | None = None) -> AmplitudeParameters:
     """Sa, Sq, Ssk, Sku and Sz of a levelled surface.
 
     Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴ with h about the mean.
@@ -43,7 +42,7 @@ def amplitude_parameters(height_um: np.ndarray, valid: np.ndarray | None = None)
         InputError: no pixel left.
     """
     counted = np.isfinite(height_um) if valid is None else np.isfinite(height_um) & valid
-    height_nm = 1e3 * height_um[counted].astype(np.float64)
+    height_nm = 1e3 * height_um[counted].astype(float)
     if height_nm.size == 0:
         raise InputError("surface", got="no valid pixel", wanted="at least one")
     deviation = height_nm - height_nm.mean()
@@ -60,7 +59,7 @@ def amplitude_parameters(height_um: np.ndarray, valid: np.ndarray | None = None)
     )
 
 
-def autocorrelation(height_um: np.ndarray) -> np.ndarray:
+def autocorrelation(height_um: Array) -> Array:
     """Normalised autocorrelation for lags of 0 … half the field, shape (ny // 2, 2 (nx // 2) − 1).
 
     Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx // 2 − 1)`` columns; the sum at each
@@ -71,7 +70,7 @@ def autocorrelation(height_um: np.ndarray) -> np.ndarray:
     """
     if not np.isfinite(height_um).all():
         raise InputError("surface", got="NaN", wanted="finite heights for an autocorrelation")
-    deviation = height_um.astype(np.float64) - height_um.mean(dtype=np.float64)
+    deviation = height_um.astype(float) - height_um.mean(dtype=float)
     ny, nx = deviation.shape
     padded = [scipy.fft.next_fast_len(size + size // 2, real=True) for size in (ny, nx)]
     spectrum = scipy.fft.rfft2(deviation, padded)
@@ -84,25 +83,27 @@ def autocorrelation(height_um: np.ndarray) -> np.ndarray:
     return covariance / covariance[0, nx // 2 - 1]
 
 
-def correlation_length_um(
-    height_um: np.ndarray, pitch_um: float, axis: Axis, *, level: float = np.exp(-1)
-) -> float:
-    """Lag at which the autocorrelation along an axis first falls to ``level``, µm, linear between pixels.
+def correlation_length_um(height_um: Array, pitch_um: float, axis: Axis) -> float:
+    """Lag at which the autocorrelation along an axis first falls to 1/e, µm, linear between pixels.
 
-    Infinity if it stays above ``level`` over half the field.
+    Infinity if it stays above that over half the field.
     """
     correlation = autocorrelation(height_um)
     centre = correlation.shape[1] // 2
     profile = correlation[0, centre:] if axis == "x" else correlation[:, centre]
-    below = np.flatnonzero(profile <= level)
+    return pitch_um * first_fall(profile, np.exp(-1))
+
+
+def first_fall(values: Array, level: float) -> float:
+    """Index at which values first fall to a level, linear between them; infinity if they never do."""
+    below = np.flatnonzero(values <= level)
     if below.size == 0:
         return float("inf")
-    lag = int(below[0])
-    before, after = profile[lag - 1], profile[lag]
-    return float(pitch_um * (lag - 1 + (before - level) / (before - after)))
+    before, after = values[below[0] - 1 : below[0] + 1]
+    return float(below[0] - (level - after) / (before - after))
 
 
-def effective_samples(height_um: np.ndarray) -> float:
+def effective_samples(height_um: Array) -> float:
     """Number of independent heights in a field, for its variance: pixels / Σ ρ² over all lags.
 
     The estimate of a mean square has relative variance ``2 Σ ρ² / pixels`` for a Gaussian surface. Lags
@@ -117,6 +118,6 @@ def effective_samples(height_um: np.ndarray) -> float:
     return float(min(height_um.size, max(1.0, height_um.size / total)))
 
 
-def sq_uncertainty_nm(height_um: np.ndarray) -> float:
+def sq_uncertainty_nm(height_um: Array) -> float:
     """Standard uncertainty of Sq from the finite field: ``Sq / √(2 n_eff)``, nm (Gaussian heights)."""
     return amplitude_parameters(height_um).sq_nm / float(np.sqrt(2 * effective_samples(height_um)))

@@ -1,12 +1,11 @@
 """Slopes, developed area and texture of a surface (ISO 25178-2), and the filters that come before them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
-from litho_data.roughness.amplitude import autocorrelation
+from litho_data.roughness.amplitude import autocorrelation, first_fall
 
 # ISO 16610-61: half of the amplitude passes at the cut-off.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))
@@ -36,7 +35,7 @@ class ArealParameters(Record):
     pixels: int
 
 
-def areal_parameters(height_um: np.ndarray, pitch_um: tuple[float, float]) -> ArealParameters:
+def areal_parameters(height_um: Array, pitch_um: YX) -> ArealParameters:
     """Sdq, Sdr, Sal and Str of a levelled and filtered surface.
 
     Sdq² = mean |∇z|², Sdr = mean √(1 + |∇z|²) − 1 with the slopes of seven pixels, so that three pixels at
@@ -67,7 +66,7 @@ def areal_parameters(height_um: np.ndarray, pitch_um: tuple[float, float]) -> Ar
     )
 
 
-def low_pass(height_um: np.ndarray, pitch_um: tuple[float, float], cut_off_um: float) -> np.ndarray:
+def low_pass(height_um: Array, pitch_um: YX, cut_off_um: float) -> Array:
     """The S-filter: what is longer than the cut-off, by the Gaussian of ISO 16610-61.
 
     An amplitude passes by exp(−π (α·cut_off/λ)²), α² = ln 2 / π: by half at the cut-off. At a border and
@@ -83,23 +82,23 @@ def low_pass(height_um: np.ndarray, pitch_um: tuple[float, float], cut_off_um: f
     """
     from scipy.ndimage import gaussian_filter
 
-    height = np.asarray(height_um, dtype=np.float64)
+    height = np.asarray(height_um, dtype=float)
     if not (cut_off_um > 0 and min(pitch_um) > 0):
         raise InputError("cut-off and pitch in µm", got=(cut_off_um, pitch_um), wanted="positive numbers")
     sigma_px = [_ALPHA * cut_off_um / (np.sqrt(2 * np.pi) * pitch) for pitch in pitch_um]
     measured = np.isfinite(height)
     options = {"mode": "constant", "truncate": 6.0}
-    weight = gaussian_filter(measured.astype(np.float64), sigma_px, **options)
+    weight = gaussian_filter(measured.astype(float), sigma_px, **options)
     total = gaussian_filter(np.where(measured, height, 0.0), sigma_px, **options)
     return np.where(measured, total / np.maximum(weight, 1e-300), np.nan)
 
 
-def high_pass(height_um: np.ndarray, pitch_um: tuple[float, float], cut_off_um: float) -> np.ndarray:
+def high_pass(height_um: Array, pitch_um: YX, cut_off_um: float) -> Array:
     """The L-filter: what is shorter than the cut-off, the surface minus its ``low_pass``."""
-    return np.asarray(height_um, dtype=np.float64) - low_pass(height_um, pitch_um, cut_off_um)
+    return np.asarray(height_um, dtype=float) - low_pass(height_um, pitch_um, cut_off_um)
 
 
-def decay_lengths_um(correlation: np.ndarray, pitch_um: tuple[float, float]) -> tuple[float, float]:
+def decay_lengths_um(correlation: Array, pitch_um: YX) -> tuple[float, float]:
     """Shortest and longest distance over all directions at which a correlation first falls to 0.2, µm.
 
     Args:
@@ -112,7 +111,8 @@ def decay_lengths_um(correlation: np.ndarray, pitch_um: tuple[float, float]) -> 
 
     rows, middle = correlation.shape[0] - 1, correlation.shape[1] // 2
     largest_um = np.hypot(rows * pitch_um[0], middle * pitch_um[1])
-    distance_um = np.arange(0.0, largest_um, min(pitch_um) / 4)
+    step_um = min(pitch_um) / 4
+    distance_um = np.arange(0.0, largest_um, step_um)
     lengths = []
     for angle in np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         places = np.array(
@@ -120,25 +120,19 @@ def decay_lengths_um(correlation: np.ndarray, pitch_um: tuple[float, float]) -> 
         )
         within = (places[0] <= rows) & (places[1] >= 0) & (places[1] <= 2 * middle)
         values = map_coordinates(correlation, places[:, within], order=3, mode="mirror")
-        below = np.flatnonzero(values <= _DECAYED)
-        if below.size == 0:
-            lengths.append(float("inf"))
-            continue
-        k = below[0]
-        share = (values[k - 1] - _DECAYED) / (values[k - 1] - values[k])
-        lengths.append(float(distance_um[k - 1] + share * (distance_um[k] - distance_um[k - 1])))
+        lengths.append(step_um * first_fall(values, _DECAYED))
     return min(lengths), max(lengths)
 
 
-def _slope(height: np.ndarray, axis: int) -> np.ndarray:
+def _slope(height: Array, axis: int) -> Array:
     """Change of height per pixel, (ny, nx); three pixels at each end of the axis are not to be used."""
     from scipy.ndimage import correlate1d
 
     return correlate1d(height, np.array(_SLOPE) / 60, axis=axis)
 
 
-def _checked(height_um: np.ndarray, pitch_um: tuple[float, float]) -> np.ndarray:
-    height = np.asarray(height_um, dtype=np.float64)
+def _checked(height_um: Array, pitch_um: YX) -> Array:
+    height = np.asarray(height_um, dtype=float)
     if height.ndim != 2 or not np.isfinite(height).all():
         raise InputError("surface", got="gaps or no map", wanted="finite heights (ny, nx)")
     if not min(pitch_um) > 0:

@@ -1,13 +1,12 @@
 """The period of a grating: where the spectrum peaks, then how its phase advances over the field."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
@@ -37,7 +36,7 @@ class Scale(Record):
     uncertainty: float
 
 
-def find_wave(height_um: np.ndarray, pitch_um: tuple[float, float], period_um: float, axis: Axis) -> Wave:
+def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> Wave:
     """The fundamental of a grating whose period lies along an axis, to a few degrees.
 
     The phase is measured in windows of two periods (Hann along the axis, all of the other axis). Its slope
@@ -77,7 +76,7 @@ def find_wave(height_um: np.ndarray, pitch_um: tuple[float, float], period_um: f
     return Wave(float(x), float(y), error)
 
 
-def line_bow(height_um: np.ndarray, pitch_um: tuple[float, float], wave: Wave) -> tuple[float, float]:
+def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
     """By how much the middle of a line lies too far along x, against its ends, µm; and its uncertainty.
 
     A pixel at x of a line of length L shows what lies at x + 4 b (x / L) (1 - x / L), up to shift and scale.
@@ -123,7 +122,7 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
     return found
 
 
-def _peak(flat: np.ndarray, pitch_um: tuple[float, float], period_um: float) -> np.ndarray:
+def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
     """Strongest frequency (along, across) within the range, and within 15° of the axis."""
     ny, nx = flat.shape
     windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
@@ -137,9 +136,7 @@ def _peak(flat: np.ndarray, pitch_um: tuple[float, float], period_um: float) -> 
     return np.array([along[0, column], across[row, 0]])
 
 
-def _advance(
-    flat: np.ndarray, pitch_um: tuple[float, float], at: np.ndarray
-) -> tuple[np.ndarray, float, float]:
+def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
     """By how much the frequency (along, across) is off, the uncertainty of the first, scatter in rad."""
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
@@ -154,7 +151,7 @@ def _advance(
     return np.array([slope, tilt]) / (2 * np.pi), error / (2 * np.pi), scatter
 
 
-def _phases(carried: np.ndarray, x_um: np.ndarray, period_um: float) -> tuple[np.ndarray, np.ndarray]:
+def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array]:
     width_um = _WINDOW_PERIODS * period_um
     places = np.arange(x_um[0] + width_um / 2, x_um[-1] - width_um / 2, width_um / 2)
     distance = (x_um[None, :] - places[:, None]) / width_um
@@ -162,7 +159,7 @@ def _phases(carried: np.ndarray, x_um: np.ndarray, period_um: float) -> tuple[np
     return places, np.unwrap(np.angle(windows @ carried))
 
 
-def _line(places: np.ndarray, phases: np.ndarray) -> tuple[float, float, float]:
+def _line(places: Array, phases: Array) -> tuple[float, float, float]:
     """Slope, its standard uncertainty, and scatter of phases about a straight line."""
     centred = places - places.mean()
     slope = float(centred @ phases / (centred @ centred))

@@ -5,16 +5,15 @@ the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. This is exact for any p
 any autocorrelation (compare arXiv:2001.00433, which treats the same bias for polynomials).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 import scipy.fft
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 
-Correlation = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Correlation = Callable[[Array, Array], Array]
 
 
 def gaussian_correlation(length_um: float) -> Correlation:
@@ -28,7 +27,7 @@ def exponential_correlation(length_um: float) -> Correlation:
 
 
 def retained_variance(
-    shape: tuple[int, int],
+    shape: Shape,
     pitch_um: float,
     correlation: Correlation,
     *,
@@ -77,7 +76,7 @@ def _largest(degree: int | tuple[int, int], axis: int) -> int:
     return largest
 
 
-def _orthonormal_polynomials(size: int, degree: int) -> np.ndarray:
+def _orthonormal_polynomials(size: int, degree: int) -> Array:
     """Polynomials of degree 0…``degree``, orthonormal over ``size`` pixels, shape (degree + 1, size)."""
     if size <= degree:
         raise InputError("pixels for a polynomial", got=size, wanted=f"more than its degree {degree}")
@@ -86,7 +85,7 @@ def _orthonormal_polynomials(size: int, degree: int) -> np.ndarray:
     return orthonormal.T
 
 
-def _wrapped_lags(size: int) -> np.ndarray:
+def _wrapped_lags(size: int) -> Array:
     """Lags 0, 1, … and −1, −2, … in the order of a circular convolution."""
     lags = np.arange(size)
     return np.where(lags <= size // 2, lags, lags - size)

@@ -1,15 +1,14 @@
 """Separating line noise from pixel noise, and the print's roughness from the microscope's."""
 
-from __future__ import annotations
-
 from math import comb
-from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.roughness.amplitude import amplitude_parameters, sq_uncertainty_nm
+from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
 # Median absolute deviation of a Gaussian: 0.6745 sd.
@@ -45,7 +44,7 @@ class PrintRoughness(Record):
     substrate_uncertainty_nm: float
 
 
-def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
+def split_noise(height_um: Array, *, fast_axis: Axis = "x") -> NoiseSplit:
     """Separate the offsets of scan lines from noise of single pixels.
 
     Second differences ``z₋ − 2z₀ + z₊`` of white noise have 6 times its variance. The difference of
@@ -59,12 +58,11 @@ def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
     Raises:
         InputError: NaN in the surface, or fewer than 8 pixels along an axis.
     """
-    require_known("fast_axis", fast_axis, get_args(Axis))
     if not np.isfinite(height_um).all() or min(height_um.shape) < 8:
         raise InputError(
             "surface", got=f"{height_um.shape} px", wanted="finite heights, at least 8 px each way"
         )
-    lines = 1e3 * (height_um if fast_axis == "x" else height_um.T).astype(np.float64)
+    lines = lines_nm(height_um, fast_axis)
     pixel_nm = _robust_sd(np.diff(lines, 2, axis=1)) / 6**0.5
     return NoiseSplit(
         pixel_nm=pixel_nm,
@@ -74,7 +72,7 @@ def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
     )
 
 
-def white_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> tuple[float, float]:
+def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
     """Pixel noise and line noise of a scan of any print, nm: what is white at the finest scales.
 
     A printer writes nothing finer than its spot, so differences of high order leave noise alone: those along
@@ -88,7 +86,7 @@ def white_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> tuple[float,
     Returns:
         sd of the pixels' and of the lines' noise; NaN for one that too few pixels determine.
     """
-    lines = 1e3 * (height_um if fast_axis == "x" else height_um.T).astype(np.float64)
+    lines = lines_nm(height_um, fast_axis)
     pixel_nm = _fine_sd(_fine(_fine(lines, 0), 1))
     measured = np.isfinite(lines)
     count = measured.sum(axis=1)
@@ -97,17 +95,17 @@ def white_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> tuple[float,
     return pixel_nm, float(np.sqrt(max(0.0, line_nm**2 - pixel_nm**2 / max(1.0, float(np.median(count))))))
 
 
-def _fine(values: np.ndarray, axis: int) -> np.ndarray:
+def _fine(values: Array, axis: int) -> Array:
     """Differences of order ``_FINE_ORDER`` along an axis; white noise keeps its variance."""
     return np.diff(values, _FINE_ORDER, axis=axis) / comb(2 * _FINE_ORDER, _FINE_ORDER) ** 0.5
 
 
-def _fine_sd(differences: np.ndarray) -> float:
+def _fine_sd(differences: Array) -> float:
     known = differences[np.isfinite(differences)]
     return _robust_sd(known) if known.size > _FINE_ORDER else float("nan")
 
 
-def print_roughness(flat_um: np.ndarray, substrate_um: np.ndarray) -> PrintRoughness:
+def print_roughness(flat_um: Array, substrate_um: Array) -> PrintRoughness:
     """Roughness of a print from a flat print and a bare substrate, in quadrature.
 
     ``print² = flat² − substrate²``: microscope and substrate are assumed to add independently. Level both
@@ -135,11 +133,11 @@ def print_roughness(flat_um: np.ndarray, substrate_um: np.ndarray) -> PrintRough
     )
 
 
-def _line_sd(lines: np.ndarray, pixel_nm: float) -> float:
+def _line_sd(lines: Array, pixel_nm: float) -> float:
     """Sd of the offsets of lines, without what pixel noise adds to a median."""
     step_variance = _robust_sd(np.diff(np.median(lines, axis=1))) ** 2
     return float(np.sqrt(max(0.0, step_variance / 2 - np.pi / 2 * pixel_nm**2 / lines.shape[1])))
 
 
-def _robust_sd(values: np.ndarray) -> float:
+def _robust_sd(values: Array) -> float:
     return float(_MAD_TO_SD * np.median(np.abs(values - np.median(values))))

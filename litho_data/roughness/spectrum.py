@@ -1,13 +1,12 @@
 """Power spectral densities whose integral is the variance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.scan import Axis
 
 
@@ -21,11 +20,11 @@ class Spectrum:
             nm²·µm² for a radial mean of the two-dimensional density (``∫ 2πf·density df`` is Sq²).
     """
 
-    frequency_per_um: np.ndarray
-    density: np.ndarray
+    frequency_per_um: Array
+    density: Array
 
 
-def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
+def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
     """One-sided power spectral density along one axis, averaged over the lines.
 
     Each line loses its mean and slope, is weighted by a Hann window (divided out in power), and its
@@ -52,7 +51,7 @@ def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: boo
     return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
 
 
-def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -> Spectrum:
+def psd_radial(height_um: Array, pitch_um: float, *, window: bool = True) -> Spectrum:
     """Radial mean of the two-dimensional power spectral density, square pixels.
 
     Args:
@@ -63,25 +62,38 @@ def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -
     Raises:
         InputError: NaN in the surface, or fewer than 8 pixels along an axis.
     """
+    from scipy.ndimage import mean
+
     _lines(height_um, "x"), _lines(height_um, "y")
-    height_nm = 1e3 * height_um.astype(np.float64)
+    height_nm = 1e3 * height_um.astype(float)
     ny, nx = height_nm.shape
-    weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1]) if window else np.ones((ny, nx))
+    weight = hann(height_nm.shape) if window else np.ones((ny, nx))
     height_nm = height_nm - (height_nm * weight).sum() / weight.sum()
     density = np.abs(np.fft.fft2(height_nm * weight)) ** 2 * pitch_um**2 / np.sum(weight**2)
     frequency = np.hypot(np.fft.fftfreq(ny, pitch_um)[:, None], np.fft.fftfreq(nx, pitch_um)[None, :])
     width = 1 / (min(ny, nx) * pitch_um)
-    bins = np.rint(frequency / width).astype(int).ravel()
-    rings = min(ny, nx) // 2 + 1
-    inside = bins < rings
-    pixels = np.bincount(bins[inside], minlength=rings)
-    total = np.bincount(bins[inside], weights=density.ravel()[inside], minlength=rings)
-    return Spectrum(np.arange(1, rings) * width, total[1:] / pixels[1:])
+    rings = np.arange(1, min(ny, nx) // 2 + 1)
+    return Spectrum(rings * width, mean(density, np.rint(frequency / width).astype(int), rings))
 
 
-def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
+def hann(shape: Shape) -> Array:
+    """Hann window of a field (ny, nx), nowhere zero."""
+    ny, nx = shape
+    return np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
+
+
+def lines_nm(height_um: Array, axis: Axis) -> Array:
+    """Profiles along an axis as rows, nm.
+
+    Raises:
+        InputError: another axis.
+    """
     require_known("axis", axis, get_args(Axis))
-    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
+    return 1e3 * (height_um if axis == "x" else height_um.T).astype(float)
+
+
+def _lines(height_um: Array, axis: Axis) -> Array:
+    lines = lines_nm(height_um, axis)
     if not np.isfinite(lines).all():
         raise InputError(
             "surface", got="NaN", wanted="finite heights for a spectrum", hint="crop to valid pixels"
@@ -91,6 +103,6 @@ def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
     return lines - lines.mean(axis=1, keepdims=True)
 
 
-def _straight_line(lines: np.ndarray) -> np.ndarray:
+def _straight_line(lines: Array) -> Array:
     position = np.arange(lines.shape[1]) - (lines.shape[1] - 1) / 2
     return np.outer(lines @ position / (position @ position), position)

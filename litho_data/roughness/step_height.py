@@ -1,14 +1,13 @@
 """Step heights in the windows of ISO 5436-1: off the edges, with one common slope, line by line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
+from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
 # Of a rough surface without step the largest change is 4 to 5 times the usual one.
@@ -33,7 +32,7 @@ class StepHeight(Record):
 
 
 def groove_depth(
-    height_um: np.ndarray, pitch_um: float, *, left_um: float, right_um: float, axis: Axis = "x"
+    height_um: Array, pitch_um: float, *, left_um: float, right_um: float, axis: Axis = "x"
 ) -> StepHeight:
     """Height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
 
@@ -67,7 +66,7 @@ def groove_depth(
 
 
 def stair_steps(
-    height_um: np.ndarray, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
+    height_um: Array, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
 ) -> list[StepHeight]:
     """Heights of the steps of a staircase, one per edge, positive upwards.
 
@@ -96,13 +95,12 @@ def stair_steps(
     return _fit_steps(lines, position_um, treads)
 
 
-def _profiles(height_um: np.ndarray, pitch_um: float, axis: Axis) -> tuple[np.ndarray, np.ndarray]:
-    require_known("axis", axis, get_args(Axis))
-    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
+def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Array]:
+    lines = lines_nm(height_um, axis)
     return lines, (np.arange(lines.shape[1]) + 0.5) * pitch_um
 
 
-def _fit_steps(lines: np.ndarray, position_um: np.ndarray, treads: list[np.ndarray]) -> list[StepHeight]:
+def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[StepHeight]:
     """Differences of neighbouring treads, line by line, with one slope per line."""
     used = np.any(treads, axis=0)
     design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
@@ -120,7 +118,7 @@ def _fit_steps(lines: np.ndarray, position_um: np.ndarray, treads: list[np.ndarr
     return [_summary(step) for step in np.array(heights).T]
 
 
-def _summary(step_nm: np.ndarray) -> StepHeight:
+def _summary(step_nm: Array) -> StepHeight:
     sd_nm = float(step_nm.std(ddof=1))
     # Neighbouring lines of a print share its roughness, so they do not count as independent.
     independent = _independent_lines(step_nm) if sd_nm > 0 else float(step_nm.size)
@@ -132,7 +130,7 @@ def _summary(step_nm: np.ndarray) -> StepHeight:
     )
 
 
-def _independent_lines(values: np.ndarray) -> float:
+def _independent_lines(values: Array) -> float:
     """n / (1 + 2 Σ ρ) with the sum up to the first negative ρ (initial positive sequence)."""
     deviation = values - values.mean()
     correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
@@ -141,7 +139,7 @@ def _independent_lines(values: np.ndarray) -> float:
     return float(values.size / max(1.0, 1 + 2 * correlation[1:until].sum()))
 
 
-def find_step(height_um: np.ndarray, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
+def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
     """Height of the steps of a step, ridge, groove or row of grooves, wherever its edges are.
 
     Edges are where the median profile changes by at least half of its largest change, the slope of the field

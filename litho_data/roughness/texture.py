@@ -1,7 +1,5 @@
 """Whether a surface has lines: in which direction, and whether they repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +7,8 @@ import numpy as np
 from scipy.special import digamma, gammaincc, ndtri, polygamma
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
+from litho_data.roughness.spectrum import hann
 
 FEWEST_LINES = 64
 # A peak is compared with the frequencies around it, beyond its own width under a Hann window.
@@ -57,7 +57,7 @@ class LinePeriod:
     coherence: float
 
 
-def line_direction(heights_um: Sequence[np.ndarray]) -> LineDirection:
+def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Direction in which surfaces of one kind change least, from their power spectra.
 
     Each frequency (fx, fy) counts with its power at twice its angle, each surface by its own variance. Random
@@ -81,7 +81,7 @@ def line_direction(heights_um: Sequence[np.ndarray]) -> LineDirection:
     )
 
 
-def _mean_vector(height_um: np.ndarray) -> tuple[complex, float]:
+def _mean_vector(height_um: Array) -> tuple[complex, float]:
     """Mean double-angle vector of the power of a surface, and its variance if all directions are alike."""
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
@@ -89,7 +89,7 @@ def _mean_vector(height_um: np.ndarray) -> tuple[complex, float]:
     finite = np.isfinite(height)
     height = np.where(finite, height - height[finite].mean(), 0.0)
     ny, nx = height.shape
-    weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
+    weight = hann(height.shape)
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
@@ -103,7 +103,7 @@ def _mean_vector(height_um: np.ndarray) -> tuple[complex, float]:
     return complex((power * np.exp(2j * angle)).sum() / total), float(variance)
 
 
-def line_period(means_um: Sequence[np.ndarray], pitch_um: float) -> LinePeriod | None:
+def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
     """The strongest period that the means of lines have in common, over all scans; None below 64 lines.
 
     The mean periodogram of F scans over its level is distributed as Gamma(F) / F where lines are random. The
@@ -142,7 +142,7 @@ def line_period(means_um: Sequence[np.ndarray], pitch_um: float) -> LinePeriod |
     )
 
 
-def _against_surroundings(power: np.ndarray, scans: int) -> tuple[np.ndarray, np.ndarray]:
+def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
     """Level of each frequency from those around it, and the chance that it lies so far above."""
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)

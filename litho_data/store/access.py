@@ -9,6 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,7 +74,7 @@ def has_child(parent: zarr.Group, name: str) -> bool:
     return _child(parent, name) is not None
 
 
-def values_of(parent: zarr.Group, name: str) -> np.ndarray:
+def values_of(parent: zarr.Group, name: str) -> Array:
     """All values of a child array.
 
     Raises:
@@ -82,7 +83,7 @@ def values_of(parent: zarr.Group, name: str) -> np.ndarray:
     return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
 
 
-def decoded(array: zarr.Array, selection: Any, what: str) -> np.ndarray:
+def decoded(array: zarr.Array, selection: Any, what: str) -> Array:
     """A selection of an array.
 
     Raises:
@@ -145,5 +146,5 @@ def _of_kind(parent: zarr.Group, name: str, kind: type[T], what: str) -> T:
     return child
 
 
-def _plain(values: np.ndarray) -> np.ndarray:
+def _plain(values: Array) -> Array:
     return np.array([str(value) for value in values], dtype=object) if values.dtype.kind in "OTU" else values

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, damaged, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
     HEIGHT_UM,
@@ -221,7 +222,7 @@ def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...
     return [(int(ny), int(nx)) for ny, nx in zip(*sides, strict=True)]
 
 
-def require_possible(samples: Mapping[str, np.ndarray], levels: int, what: str) -> None:
+def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> None:
     """Refuse the arrays of a scan that show no print: levels that are none, or nothing measured.
 
     Raises:

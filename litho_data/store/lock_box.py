@@ -4,8 +4,6 @@ Every choice follows from a hash of the ids and a seed. It depends on no library
 same ids always give the same lock box.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import Protocol

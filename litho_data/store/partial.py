@@ -20,6 +20,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.files import atomic_file, publish, unfinished
+from litho_data.foundation.kinds import Array
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group
@@ -33,7 +34,12 @@ class Piece:
     """One finished scan: its arrays by name, and a record of plain data with ``id``, ``key``, ``steps``, …"""
 
     record: Mapping[str, Any]
-    arrays: Mapping[str, np.ndarray]
+    arrays: Mapping[str, Array]
+
+
+def outputs_of(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What the steps of a scan's record have made: name, hash, shape, …"""
+    return [output for step in record["steps"] for output in step["outputs"]]
 
 
 @contextmanager
@@ -106,7 +112,7 @@ class PartialStore:
         with atomic_file(self._pieces / f"{scan_id}.json") as temporary:
             temporary.write_text(json.dumps(piece.record), encoding="utf-8")
 
-    def samples(self, scan_id: str) -> dict[str, np.ndarray]:
+    def samples(self, scan_id: str) -> dict[str, Array]:
         """The arrays of one finished scan on the layout grid."""
         with np.load(self._pieces / f"{scan_id}.npz", allow_pickle=False) as archive:
             return dict(archive)
@@ -121,7 +127,7 @@ class PartialStore:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _intact(self, root: zarr.Group, record: Mapping[str, Any]) -> bool:
-        hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
+        hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
         try:
             arrays = self.samples(record["id"])
             group = group_of(root, f"scans/{record['id']}")

@@ -1,7 +1,5 @@
 """One printed field as everything in this project sees it, and the key of the whole of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.register.bend import Bend
 
 
@@ -43,13 +42,13 @@ class PrintedScan:
     id: str
     print_id: str
     order: int
-    mask_level: np.ndarray
-    height_um: np.ndarray
-    valid: np.ndarray
+    mask_level: Array
+    height_um: Array
+    valid: Array
     pitch_um: float
     level_height_um: float
     levels: int
-    scan_to_layout: np.ndarray
+    scan_to_layout: Array
     write: Mapping[str, Any] | None = None
     field_x_um: float | None = None
     field_y_um: float | None = None
@@ -60,7 +59,7 @@ class PrintedScan:
     pixel_size: float | None = None
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
-    height_sigma_um: np.ndarray | None = None
+    height_sigma_um: Array | None = None
     groups: Mapping[str, str] = field(default_factory=dict)
     instrument: str = ""
     surround: str = "unknown"
@@ -84,12 +83,12 @@ class PrintedScan:
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
     @property
-    def usable(self) -> np.ndarray:
+    def usable(self) -> Array:
         """Measured pixels, bool (ny, nx)."""
         return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
 
     @property
-    def layout_um(self) -> np.ndarray:
+    def layout_um(self) -> Array:
         """Nominal height, float32 (ny, nx), µm."""
         return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
 
@@ -105,7 +104,7 @@ def scan_sha256(scan: PrintedScan) -> str:
 
 
 def _hashed(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, Array):
         return array_sha256(value, "", ())
     if is_dataclass(value):
         return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}

@@ -11,9 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from litho_data.foundation.errors import damaged, unknown_name
+from litho_data.foundation.kinds import YX, Array
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,
@@ -149,7 +148,7 @@ class Store:
         """All scans in stored order, in memory."""
         return [self.scan(scan_id) for scan_id in self.ids]
 
-    def sample(self, name: str, row: int) -> np.ndarray:
+    def sample(self, name: str, row: int) -> Array:
         """One scan's slice of one array in its true shape.
 
         Raises:
@@ -162,7 +161,7 @@ class Store:
         ny, nx = self.shapes[row]
         return values[:ny, :nx]
 
-    def scan_frame(self, scan_id: str, name: str) -> np.ndarray:
+    def scan_frame(self, scan_id: str, name: str) -> Array:
         """An array of a scan in its own frame: ``raw_height_um``, ``levelled_height_um``, ``removed_um``, …
 
         Raises:
@@ -194,7 +193,7 @@ class Store:
             uses = {name: str(group.attrs["use"]) for name, group in groups.items()}
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
-    def recorded_pitches_um(self) -> dict[str, tuple[float, float]]:
+    def recorded_pitches_um(self) -> dict[str, YX]:
         """Pitch (y, x) of the scans, references too, as their reader recorded it."""
         pitches = {}
         for row in self.manifest.get("files", []):

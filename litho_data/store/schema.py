@@ -1,7 +1,5 @@
 """The dataset store on one screen: arrays, dimensions, types, units, and the hash of a dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -9,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
@@ -32,7 +31,7 @@ class Variable:
         """The dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
-    def sample_sha256(self, sample: np.ndarray) -> str:
+    def sample_sha256(self, sample: Array) -> str:
         """Hash of one scan's slice in its true shape, so padding and chunking have no influence."""
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     MIXED_UNITS,
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
 """What fills the place beyond a layout that is smaller than the largest."""
-# By default a chunk of nothing but fill values has no file, and would look like one that was lost.
-_EVERY_CHUNK: Any = {"write_empty_chunks": True}
 # What an image of a scan shows.
 _SHOWN = ("levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
@@ -38,7 +37,7 @@ _CF: dict[str, dict[str, Any]] = {
 
 
 def write_scan_group(
-    root: zarr.Group, scan_id: str, arrays: Mapping[str, np.ndarray], use: str, pitch_um: Sequence[float]
+    root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
     """Group ``scans/<id>``: what one scan looked like in its own frame, an image of OME-Zarr as well.
 
@@ -69,7 +68,7 @@ def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
 def write_samples(
     root: zarr.Group,
     scans: Sequence[Mapping[str, Any]],
-    load: Callable[[str], Mapping[str, np.ndarray]],
+    load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
     """The arrays over all scans, streamed one scan at a time.
@@ -114,7 +113,7 @@ def write_samples(
             write_numbers(root, name, centres, axis, attributes={"units": "um", **described})
 
 
-def pixel_centres_um(count: int, pitch_um: float) -> np.ndarray:
+def pixel_centres_um(count: int, pitch_um: float) -> Array:
     """Coordinates of pixel centres along one axis, µm."""
     return (np.arange(count) + 0.5) * pitch_um
 
@@ -134,38 +133,31 @@ def write_table(
 
 def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str) -> None:
     """A one-dimensional array of UTF-8 texts."""
-    size = (max(len(values), 1),)
-    array = group.create_array(
-        name,
-        shape=(len(values),),
-        chunks=size,
-        dtype="string",
-        compressors=_compressors(),
-        config=_EVERY_CHUNK,
-        dimension_names=(dim,),
-    )
-    array[...] = np.array(values, dtype=object)
+    _write(group, name, np.array(values, dtype=object), dim, "string")
 
 
 def write_numbers(
-    group: zarr.Group,
-    name: str,
-    values: np.ndarray,
-    dim: str,
-    attributes: Mapping[str, Any] | None = None,
+    group: zarr.Group, name: str, values: Array, dim: str, attributes: Mapping[str, Any] | None = None
 ) -> None:
     """A one-dimensional array of numbers."""
-    array = group.create_array(
-        name,
-        shape=values.shape,
-        chunks=(max(len(values), 1),),
-        dtype=values.dtype,
-        compressors=_compressors(),
-        config=_EVERY_CHUNK,
-        dimension_names=(dim,),
-        attributes=dict(attributes or {}),
-    )
+    _write(group, name, values, dim, values.dtype, attributes=dict(attributes or {}))
+
+
+def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **more: Any) -> None:
+    shape, chunks = values.shape, (max(len(values), 1),)
+    array = _array(group, name, shape=shape, chunks=chunks, dtype=dtype, dimension_names=(dim,), **more)
     array[...] = values
+
+
+def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array:
+    """A new array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unseen.
+
+    By default a chunk of nothing but fill values has no file, and would look like one that was lost.
+    """
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    packed = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
+    return group.create_array(name, compressors=packed, config={"write_empty_chunks": True}, **described)
 
 
 def consolidate(root: zarr.Group) -> None:
@@ -178,7 +170,7 @@ def consolidate(root: zarr.Group) -> None:
         zarr.consolidate_metadata(root.store)
 
 
-def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any) -> zarr.Array:
+def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.Array:
     variable = VARIABLES[name]
     unit = {"comment": MIXED_UNITS[name]} if name in MIXED_UNITS else {"units": variable.unit}
     attributes = {**unit, "long_name": variable.long_name, **_CF.get(name, {})}
@@ -187,27 +179,19 @@ def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any)
     # A scan's own frame has other sizes than the layouts: in one tree its axes need other names.
     frame = {} if variable.dims[0] == "scan" else _OWN_FRAME
     names = tuple(frame.get(dim, dim) for dim in variable.dims)
-    return group.create_array(
+    return _array(
+        group,
         name,
         shape=shape,
         dtype=variable.dtype,
         fill_value=np.nan if variable.dtype.startswith("float") else 0,
-        compressors=_compressors(),
-        config=_EVERY_CHUNK,
         dimension_names=names,
         attributes=attributes,
         **layout,
     )
 
 
-def _compressors() -> list[Any]:
-    """Zstandard on shuffled bytes, then a checksum over everything, so that no flipped byte goes unseen."""
-    from zarr.codecs import BloscCodec, Crc32cCodec
-
-    return [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
-
-
-def _padded(name: str, sample: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _padded(name: str, sample: Array, shape: Shape) -> Array:
     """A sample in the upper left corner of the common shape; ``PADDING`` elsewhere."""
     if sample.shape == shape:
         return sample

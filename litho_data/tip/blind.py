@@ -7,13 +7,12 @@ the contacts that are possible there, until the opening of the image by the tip 
 noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.tip.morphology import dilate, erode
 
 _PIXELS_A_ROUND = 300
@@ -22,7 +21,7 @@ _ROUNDS = 6
 _MOST_CONTACTS = 200
 
 
-def blind_tip(images_um: Sequence[np.ndarray], half_px: int, threshold_um: float) -> np.ndarray:
+def blind_tip(images_um: Sequence[Array], half_px: int, threshold_um: float) -> Array:
     """Upper bound of the tip that made all these images.
 
     The bound is mirrored, as the tip appears in an image: where the image of a spike falls off.
@@ -58,7 +57,7 @@ def blind_tip(images_um: Sequence[np.ndarray], half_px: int, threshold_um: float
     return tip
 
 
-def full_angle_bound_deg(tip: np.ndarray, pitch_um: tuple[float, float]) -> float:
+def full_angle_bound_deg(tip: Array, pitch_um: YX) -> float:
     """Upper bound of the angle between opposite flanks: the sharpest cone from the end of the tip, degrees.
 
     A rounded cone lies outside the cone itself, so that radius/depth of no ring is below the tangent of its
@@ -79,7 +78,7 @@ def full_angle_bound_deg(tip: np.ndarray, pitch_um: tuple[float, float]) -> floa
     return float(np.degrees(2 * np.arctan(sharpest)))
 
 
-def _tighten(tip: np.ndarray, image: np.ndarray, threshold_um: float) -> None:
+def _tighten(tip: Array, image: Array, threshold_um: float) -> None:
     """Lower the bound, in place, by the pixels where it explains the image least."""
     from scipy.ndimage import maximum_filter
 
@@ -99,7 +98,7 @@ def _tighten(tip: np.ndarray, image: np.ndarray, threshold_um: float) -> None:
         _lower(tip, window, threshold_um)
 
 
-def _lower(tip: np.ndarray, window: np.ndarray, threshold_um: float) -> None:
+def _lower(tip: Array, window: Array, threshold_um: float) -> None:
     """Lower the bound by one pixel; ``window`` (4 half + 1, …) is the image around it minus its height."""
     size, half = tip.shape[0], tip.shape[0] // 2
     opposite = window[half : half + size, half : half + size][::-1, ::-1]

@@ -6,11 +6,10 @@ image says of it is one pixel: a valley with a curvature beyond that of the tip.
 those whose highest possible height is set by such a valley (Villarrubia 1997, section 5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.register.topography import smooth_measured
 from litho_data.tip.curvature import (
     DISC_RADII_PX,
@@ -31,7 +30,7 @@ _CORE = 0.55
 _SMOOTHING = 0.25
 
 
-def tip_certain(height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
     """Pixels of the surface that the tip touched, bool (ny, nx), with one pixel to spare.
 
     With an upper bound for the radius, more pixels than necessary are uncertain. False where nothing was
@@ -64,7 +63,7 @@ def tip_certain(height_um: np.ndarray, pitch_um: tuple[float, float], radius_um:
     return measured & ~binary_dilation(valley[found.row, found.column])
 
 
-def reconstructed(height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
     """The highest surface that gives this image, (ny, nx) µm: the image eroded by the tip.
 
     It is the surface itself where the tip touched and lies above it elsewhere. Noise is taken for surface:
@@ -79,7 +78,7 @@ def reconstructed(height_um: np.ndarray, pitch_um: tuple[float, float], radius_u
     return paraboloid_erosion(_checked(height_um, radius_um), pitch_um, radius_um).surface
 
 
-def _checked(height_um: np.ndarray, radius_um: float) -> np.ndarray:
+def _checked(height_um: Array, radius_um: float) -> Array:
     if not (np.isfinite(radius_um) and radius_um > 0):
         raise InputError("radius of the tip", got=radius_um, wanted="a positive number in µm")
-    return np.asarray(height_um, dtype=np.float64)
+    return np.asarray(height_um, dtype=float)

@@ -1,11 +1,11 @@
 """Noise of a scan, and curvatures over small discs with their noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+
+from litho_data.foundation.kinds import YX, Array
 
 _MAD_PER_SIGMA = 0.6744897501960817
 _FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)
@@ -24,7 +24,7 @@ class Noise:
     lines_are_rows: bool
 
 
-def noise_of(height_um: np.ndarray) -> Noise:
+def noise_of(height_um: Array) -> Noise:
     """Noise of a scan (ny, nx), µm, from fourth differences, which are 0 on a parabola: the print of a tip.
 
     What varies more down the columns than along the rows is an offset of whole rows, and the other way round.
@@ -34,7 +34,7 @@ def noise_of(height_um: np.ndarray) -> Noise:
     return Noise(pixel, float(np.sqrt(other**2 - pixel**2)), rows > columns)
 
 
-def highest_curvature(height_um: np.ndarray, pitch_um: tuple[float, float], radius_px: float) -> np.ndarray:
+def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
     """Highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
 
     Exact for a quadratic surface, with the least noise of all linear estimates on the disc. NaN where the
@@ -60,7 +60,7 @@ def highest_curvature(height_um: np.ndarray, pitch_um: tuple[float, float], radi
     return highest
 
 
-def curvature_noise(noise: Noise, pitch_um: tuple[float, float], radius_px: float) -> float:
+def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
     """Standard deviation of a curvature of a flat scan with this noise, 1/µm; the larger of both axes."""
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
@@ -71,7 +71,7 @@ def curvature_noise(noise: Noise, pitch_um: tuple[float, float], radius_px: floa
 
 
 @lru_cache(maxsize=64)
-def disc_kernels(radius_px: float, pitch_um: tuple[float, float]) -> np.ndarray:
+def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
     """Weights (3, n, n) of the second derivatives xx, xy, yy, 1/µm², of a quadratic fit on a disc."""
     inside = disc(radius_px)
     y_px, x_px = (places - int(radius_px) for places in np.nonzero(inside))
@@ -83,14 +83,14 @@ def disc_kernels(radius_px: float, pitch_um: tuple[float, float]) -> np.ndarray:
     return kernels
 
 
-def disc(radius_px: float) -> np.ndarray:
+def disc(radius_px: float) -> Array:
     """Pixels (n, n) of a disc, bool, n odd."""
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9
 
 
-def _fourth_difference(height_um: np.ndarray, axis: int) -> float:
+def _fourth_difference(height_um: Array, axis: int) -> float:
     lines = np.moveaxis(height_um, axis, -1)
     difference = np.diff(lines, len(_FOURTH) - 1)
     values = np.abs(difference[np.isfinite(difference)])

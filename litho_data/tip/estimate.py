@@ -1,7 +1,5 @@
 """The tip of one or more scans: its radius, or the most that it can be, and where it did not touch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -9,6 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.scan import Scan
@@ -67,7 +66,7 @@ class TipEstimate(RunFacts, Result):
     line_noise_nm: float
     window_px: int | None
     share: float | None
-    pitch_um: tuple[float, float]
+    pitch_um: YX
     scans: tuple[ScanUnderTip, ...]
 
 
@@ -119,9 +118,7 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     )
 
 
-def _under_tip(
-    name: str, height: np.ndarray, pitch_um: tuple[float, float], radius_um: float | None
-) -> ScanUnderTip:
+def _under_tip(name: str, height: Array, pitch_um: YX, radius_um: float | None) -> ScanUnderTip:
     if radius_um is None:
         return ScanUnderTip(name=name, certain_fraction=None, resolution_um=None)
     certain = tip_certain(height, pitch_um, radius_um)
@@ -132,7 +129,7 @@ def _under_tip(
     )
 
 
-def _common_pitch(scans: Sequence[Scan]) -> tuple[float, float]:
+def _common_pitch(scans: Sequence[Scan]) -> YX:
     if not scans:
         raise InputError("scans of a tip", got="none", wanted="at least one")
     pitches = [scan.require_pitch() for scan in scans]

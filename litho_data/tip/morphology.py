@@ -5,37 +5,37 @@ highest surface pixel plus tip, ``erode`` the lowest image pixel minus tip; dila
 *opening*, eroding what was dilated the *closing*. A pixel that was not measured (NaN) takes no part.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
+
+from litho_data.foundation.kinds import YX, Array
 
 
 class Eroded(NamedTuple):
     """A surface (ny, nx), and row and column of the image pixel that sets it, int32; NaN sets nothing."""
 
-    surface: np.ndarray
-    row: np.ndarray
-    column: np.ndarray
+    surface: Array
+    row: Array
+    column: Array
 
 
-def dilate(surface: np.ndarray, tip: np.ndarray) -> np.ndarray:
+def dilate(surface: Array, tip: Array) -> Array:
     """``max over u of surface(x − u) + tip(u)``, same shape; −inf where nothing was measured in reach."""
     return -_erode(-surface, tip[::-1, ::-1])
 
 
-def erode(image: np.ndarray, tip: np.ndarray) -> np.ndarray:
+def erode(image: Array, tip: Array) -> Array:
     """``min over u of image(x + u) − tip(u)``, same shape; +inf where nothing was measured in reach."""
     return _erode(image, tip)
 
 
-def paraboloid_dilation(surface: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+def paraboloid_dilation(surface: Array, pitch_um: YX, radius_um: float) -> Array:
     """The image of a surface (ny, nx), µm, under a paraboloid tip −u²/2R; NaN stays NaN."""
     return -paraboloid_erosion(-surface, pitch_um, radius_um).surface
 
 
-def paraboloid_erosion(image: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> Eroded:
+def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
     """The highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
 
     A paraboloid is the sum of two parabolas, so that the minimum is taken along one axis after the other.
@@ -53,8 +53,8 @@ def paraboloid_erosion(image: np.ndarray, pitch_um: tuple[float, float], radius_
 
 
 def _erode_rows(
-    heights: np.ndarray, places: np.ndarray, range_um: float, pitch_um: float, radius_um: float
-) -> tuple[np.ndarray, np.ndarray]:
+    heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
+) -> tuple[Array, Array]:
     """Lowest of height + distance²/2R along rows, and the place of the pixel that it belongs to."""
     lowest, owner = heights.copy(), places.copy()
     # Farther away the tip is higher than all of the image.
@@ -69,7 +69,7 @@ def _erode_rows(
     return lowest, owner
 
 
-def _erode(image: np.ndarray, tip: np.ndarray) -> np.ndarray:
+def _erode(image: Array, tip: Array) -> Array:
     from scipy.ndimage import grey_erosion
 
     heights = np.where(np.isfinite(image), image, np.asarray(np.inf, image.dtype))

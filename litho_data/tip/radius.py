@@ -6,13 +6,12 @@ image end in an edge, which is clear where the tip sets it and a thin tail where
 are taken along the lines of the scan, where offsets of lines have no say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array
 from litho_data.register.topography import remove_bow
 from litho_data.tip.curvature import QUIET, noise_of
 
@@ -56,7 +55,7 @@ class PeakRadius:
     share: float | None
 
 
-def peak_radius(height_um: np.ndarray, pitch_um: tuple[float, float]) -> PeakRadius:
+def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
     """The radius of the tip from one scan, or an upper bound, and what speaks against more.
 
     Args:
@@ -101,7 +100,7 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
         return found[0]
     if not estimates:
         return bounds[0]
-    radii = np.array([one.radius_um for one in estimates], dtype=np.float64)
+    radii = np.array([one.radius_um for one in estimates], dtype=float)
     radii = radii[radii <= radii[0] + 2 * _BOUND_SIGMA * estimates[0].sd_um]
     mean_um = float(radii.mean())
     sd_um = float(np.hypot(radii.std() / np.sqrt(len(radii)), estimates[0].sd_um))
@@ -116,7 +115,7 @@ class _Tops:
 
     half_px: int
     noise: float
-    curvature: np.ndarray
+    curvature: Array
     edge: float
 
     @property
@@ -132,10 +131,10 @@ class _Tops:
             for part in np.array_split(rows, count, axis=1)
         ]
 
-    def reach_px(self, depth_um: float, pitch_um: tuple[float, float]) -> float:
+    def reach_px(self, depth_um: float, pitch_um: YX) -> float:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
-    def doubt(self, depth_um: float, pitch_um: tuple[float, float]) -> str:
+    def doubt(self, depth_um: float, pitch_um: YX) -> str:
         """Why the edge may not be the tip's; empty if nothing speaks against it."""
         reach = self.reach_px(depth_um, pitch_um)
         if reach < _SMALLEST_REACH_PX:
@@ -159,14 +158,14 @@ class _Tops:
         return ""
 
 
-def _tops(lines: np.ndarray, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
+def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     weights = _parabola(half_px) / pitch_um**2
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
     return _Tops(half_px, noise, curvature, _edge(curvature, noise))
 
 
-def _along_lines(lines: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _along_lines(lines: Array, weights: Array) -> Array:
     """Second derivative along the lines, mean of as many lines; only whole windows, NaN around gaps."""
     from scipy.ndimage import correlate1d, uniform_filter1d
 
@@ -181,13 +180,13 @@ def _along_lines(lines: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return bent[half:-half, half:-half]
 
 
-def _parabola(half_px: int) -> np.ndarray:
+def _parabola(half_px: int) -> Array:
     """Weights of the second derivative of the best parabola through 2 half_px + 1 pixels, 1/px²."""
     x = np.arange(-half_px, half_px + 1.0)
     return np.linalg.pinv(np.stack([np.ones_like(x), x, x**2 / 2], axis=1))[2]
 
 
-def _edge(curvatures: np.ndarray, noise: float) -> float:
+def _edge(curvatures: Array, noise: float) -> float:
     """Where the curvatures end, without what noise adds; 0 or less where noise is all there is."""
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:

@@ -1,16 +1,14 @@
 """The lateral resolution that a tip leaves to a scan."""
 
-from __future__ import annotations
-
 import numpy as np
+
+from litho_data.foundation.kinds import YX, Array
 
 # Sanner et al. 2022: artefacts set in where peaks reach half of the tip's curvature.
 _SHARE = 0.5
 
 
-def lateral_resolution_um(
-    height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float
-) -> float | None:
+def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
     """Wavelength below which the scan may show the tip instead of the surface, µm.
 
     Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is taken at distance
@@ -33,7 +31,7 @@ def lateral_resolution_um(
     return max((value for value in found if value is not None), default=None)
 
 
-def _along(lines: np.ndarray, pitch_um: float, limit: float) -> float | None:
+def _along(lines: Array, pitch_um: float, limit: float) -> float | None:
     steps = np.arange(1, (len(lines) - 1) // 2 + 1)
     sharpest = np.array([_sharpest(lines, int(step)) / (step * pitch_um) ** 2 for step in steps])
     reached = np.flatnonzero(sharpest >= limit)
@@ -46,7 +44,7 @@ def _along(lines: np.ndarray, pitch_um: float, limit: float) -> float | None:
     return 2 * step * pitch_um
 
 
-def _sharpest(lines: np.ndarray, step: int) -> float:
+def _sharpest(lines: Array, step: int) -> float:
     bend = 2 * lines[step:-step] - lines[: -2 * step] - lines[2 * step :]
     finite = bend[np.isfinite(bend)]
     return float(finite.max()) if finite.size else 0.0

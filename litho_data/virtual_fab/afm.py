@@ -1,10 +1,9 @@
 """The microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 
+from litho_data.foundation.kinds import YX, Array
 from litho_data.virtual_fab.geometry import ScanFrame
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import Job
@@ -15,13 +14,13 @@ _DRIFT_DECAY_ROWS = 0.15
 
 
 def scan_surface(
-    surface_um: np.ndarray,
+    surface_um: Array,
     frame: ScanFrame,
     noise: Noise,
     knobs: KnobBoard,
     job: Job,
     rng: np.random.Generator,
-) -> np.ndarray:
+) -> Array:
     """Height that the microscope reports for a surface given at its pixels, µm.
 
     Lines are scanned from left to right (fast axis x; on the way back from right to left), the first line
@@ -59,14 +58,14 @@ def scan_surface(
     return height
 
 
-def _dilate_by_tip(height: np.ndarray, pitch_um: float, radii_um: tuple[float, float]) -> np.ndarray:
+def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
     """Path of a paraboloid tip of radii along y and x: ``max_u h(x − u) − u²/2R``, also between pixels."""
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
     return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
 
 
-def _dilate_columns(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:
+def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
     from scipy.interpolate import CubicSpline
 
     fine_um = pitch_um / _TIP_OVERSAMPLING
@@ -84,7 +83,7 @@ def _dilate_columns(height: np.ndarray, pitch_um: float, radius_um: float) -> np
     return highest
 
 
-def _follow_surface(height: np.ndarray, pitch_um: float, lag_um: float) -> np.ndarray:
+def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
     """First-order feedback along the lines, which loses the surface more easily on falling edges."""
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
@@ -99,7 +98,7 @@ def _follow_surface(height: np.ndarray, pitch_um: float, lag_um: float) -> np.nd
 
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
-) -> np.ndarray:
+) -> Array:
     """Everything that is added to the height, independent of the surface, nm."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
@@ -126,7 +125,7 @@ def _additive_nm(
     return total
 
 
-def _scar(height: np.ndarray, scars_per_row: float, rng: np.random.Generator) -> np.ndarray:
+def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
     """Scars along the fast axis and single-pixel spikes, of either sign."""
     scarred = height.copy()
     ny, nx = height.shape

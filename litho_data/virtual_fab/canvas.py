@@ -1,11 +1,11 @@
 """The area simulated around one layout, and spectral blurs on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
+
+from litho_data.foundation.kinds import YX, Array, Shape
 
 GUARD_PX = 96
 
@@ -21,66 +21,66 @@ class Canvas:
         write_field_um: side of the write field, µm.
     """
 
-    level: np.ndarray
+    level: Array
     pitch_um: float
-    field_um: tuple[float, float]
+    field_um: YX
     write_field_um: float
 
     @property
-    def y_um(self) -> np.ndarray:
+    def y_um(self) -> Array:
         """Row centres in the layout's frame, µm, as a column (ny, 1)."""
         return ((np.arange(self.level.shape[0]) - GUARD_PX + 0.5) * self.pitch_um)[:, None]
 
     @property
-    def x_um(self) -> np.ndarray:
+    def x_um(self) -> Array:
         """Column centres in the layout's frame, µm, as a row (1, nx)."""
         return ((np.arange(self.level.shape[1]) - GUARD_PX + 0.5) * self.pitch_um)[None, :]
 
     @property
-    def size_um(self) -> tuple[float, float]:
+    def size_um(self) -> YX:
         """(y, x) extent of the layout, µm."""
         ny, nx = self.level.shape
         return (ny - 2 * GUARD_PX) * self.pitch_um, (nx - 2 * GUARD_PX) * self.pitch_um
 
-    def field_offset_um(self) -> tuple[np.ndarray, np.ndarray]:
+    def field_offset_um(self) -> tuple[Array, Array]:
         """(y, x) distance of every pixel from the write field's centre, µm, broadcastable."""
         height_um, width_um = self.size_um
         return self.y_um - height_um / 2 + self.field_um[0], self.x_um - width_um / 2 + self.field_um[1]
 
 
-def frame_layout(level: np.ndarray) -> np.ndarray:
+def frame_layout(level: Array) -> Array:
     """Add the guard frame: the outermost levels of the layout continue outwards."""
     return np.pad(level, GUARD_PX, mode="edge")
 
 
-def cut_layout(array: np.ndarray) -> np.ndarray:
+def cut_layout(array: Array) -> Array:
     """The part of a canvas array that belongs to the layout."""
     return array[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX]
 
 
-def set_layout(array: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def set_layout(array: Array, inner: Array) -> Array:
     """A copy of a canvas array with another middle part."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed
 
 
-def frequencies_per_um(shape: tuple[int, int], pitch_um: float) -> tuple[np.ndarray, np.ndarray]:
+def frequencies_per_um(shape: Shape, pitch_um: float) -> tuple[Array, Array]:
     """(fy, fx) of the half-plane transform, cycles per µm, broadcastable."""
     return np.fft.fftfreq(shape[0], pitch_um)[:, None], np.fft.rfftfreq(shape[1], pitch_um)[None, :]
 
 
-def apply_transfer(field: np.ndarray, transfer: np.ndarray) -> np.ndarray:
+def apply_transfer(field: Array, transfer: Array) -> Array:
     """Multiply the half-plane spectrum of ``field`` by ``transfer``."""
     return scipy.fft.irfft2(scipy.fft.rfft2(field) * transfer, s=field.shape)
 
 
-def gaussian_transfer(shape: tuple[int, int], pitch_um: float, sigma_um: float) -> np.ndarray:
+def gaussian_transfer(shape: Shape, pitch_um: float, sigma_um: float) -> Array:
     """Transfer function of an isotropic Gaussian of sd ``sigma_um``."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     return np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
 
 
-def blur(field: np.ndarray, pitch_um: float, sigma_um: float) -> np.ndarray:
+def blur(field: Array, pitch_um: float, sigma_um: float) -> Array:
     """Gaussian blur of sd ``sigma_um``."""
     return apply_transfer(field, gaussian_transfer(field.shape, pitch_um, sigma_um))

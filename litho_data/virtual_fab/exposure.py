@@ -1,11 +1,10 @@
 """Exposure: hatch lines, slices and two-photon dose; what beam, galvo and field do to it."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 import scipy.signal
 
+from litho_data.foundation.kinds import Array
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import (
     GUARD_PX,
@@ -31,7 +30,7 @@ def accumulate_dose(
     relative_dose: float = 1.0,
     order: float = 0.0,
     scan_index: int = 0,
-) -> np.ndarray:
+) -> Array:
     """Two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
 
     Each row of the canvas is one hatch line. In slice k the laser is on wherever the level is at
@@ -85,7 +84,7 @@ def accumulate_dose(
     return dose
 
 
-def _unevenly_written(nominal: np.ndarray, canvas: Canvas, strength: float) -> np.ndarray:
+def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
     """Exposure with every point of a hatch line at x + strength·x(1 − x/L), 0 ≤ x ≤ L the write field."""
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
@@ -93,7 +92,7 @@ def _unevenly_written(nominal: np.ndarray, canvas: Canvas, strength: float) -> n
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
-    rows, columns = np.indices(nominal.shape, dtype=np.float64)
+    rows, columns = np.indices(nominal.shape, dtype=float)
     meant = columns + (meant_um - inside) / canvas.pitch_um
     # The spot smooths what a cubic overshoots at the edges of levels.
     return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
@@ -104,7 +103,7 @@ def field_starts(size_px: int, side_px: int) -> list[int]:
     return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
 
 
-def write_in_fields(nominal: np.ndarray, starts: list[list[int]], offset_px: np.ndarray) -> np.ndarray:
+def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
     """Exposure (ny, nx) written field by field, each off its place: doses add up where fields overlap.
 
     Args:
@@ -138,7 +137,7 @@ def _overlap(start: int, stop: int, by: int, size: int) -> tuple[slice, slice]:
     return slice(low, high), slice(low - by, high - by)
 
 
-def _field_response(canvas: Canvas, knobs: KnobBoard) -> np.ndarray | float:
+def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
     """Relative dose over the write field."""
     if not (strength := knobs["vignetting"]):
         return 1.0
@@ -147,7 +146,7 @@ def _field_response(canvas: Canvas, knobs: KnobBoard) -> np.ndarray | float:
     return np.maximum(1 - strength * (y_um**2 + x_um**2) / corner_um2, 0.0)
 
 
-def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.ndarray:
+def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
     """Transfer function of the squared spot, with its ellipticity, its ghost and the lag of the galvo."""
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
     # The square of a Gaussian intensity is a Gaussian narrower by √2.
@@ -167,9 +166,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.nda
     return transfer
 
 
-def _slice_by_slice(
-    nominal: np.ndarray, line_energy: np.ndarray | float, spot: np.ndarray, printer: Printer
-) -> np.ndarray:
+def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
     """Effective dose if every slice has to pass the threshold on its own."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
@@ -180,13 +177,13 @@ def _slice_by_slice(
     return passed
 
 
-def _soft_step(dose: np.ndarray) -> np.ndarray:
+def _soft_step(dose: Array) -> Array:
     """Logistic step that maps 0 to 0 and 1 to 1 exactly."""
     low, high = (1 / (1 + np.exp(-_SLICE_STEEPNESS * (edge - _SLICE_THRESHOLD))) for edge in (0.0, 1.0))
     return (1 / (1 + np.exp(-_SLICE_STEEPNESS * (dose - _SLICE_THRESHOLD))) - low) / (high - low)
 
 
-def _earlier_lines(dose: np.ndarray, pitch_um: float, decay_um: float) -> np.ndarray:
+def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
     """Exponentially fading mean of the lines above, which were written before."""
     memory = np.exp(-pitch_um / decay_um)
     return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

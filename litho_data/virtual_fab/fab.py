@@ -1,11 +1,10 @@
 """The fab: a printer, a microscope, their knobs and their noise; one field in, one scan out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab.afm import scan_surface
 from litho_data.virtual_fab.canvas import cut_layout
 from litho_data.virtual_fab.geometry import ScanFrame, place_scan, sample_surface
@@ -40,10 +39,10 @@ class FabScan:
 
     job: Job
     frame: ScanFrame
-    height_um: np.ndarray
-    noiseless_um: np.ndarray
-    clean_um: np.ndarray
-    surface_um: np.ndarray
+    height_um: Array
+    noiseless_um: Array
+    clean_um: Array
+    surface_um: Array
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
@@ -61,7 +60,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
     surface = print_clean(job, fab.printer, fab.knobs, fab.cause)
     rough = surface_noise(job, fab.printer, fab.noise, fab.knobs, np.random.default_rng(roughness_seed))
 
-    def scan(true_surface: np.ndarray, noise: Noise) -> np.ndarray:
+    def scan(true_surface: Array, noise: Noise) -> Array:
         sampled = sample_surface(true_surface, frame, fab.knobs, job.index, job.direction)
         if fab.cause is not None:
             sampled = fab.cause.on_scan(sampled, frame, job)

@@ -1,12 +1,11 @@
 """Where the pixels of a scan lie on the print."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
 
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.virtual_fab.canvas import GUARD_PX
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.settings import Microscope
@@ -25,24 +24,24 @@ class ScanFrame:
         layout_pitch_um: of the layout, and of the canvas around it, µm.
     """
 
-    shape: tuple[int, int]
+    shape: Shape
     pitch_um: float
-    scan_to_layout: np.ndarray
+    scan_to_layout: Array
     layout_pitch_um: float
 
     @property
-    def size_um(self) -> tuple[float, float]:
+    def size_um(self) -> YX:
         """(y, x) nominal extent, µm."""
         return self.shape[0] * self.pitch_um, self.shape[1] * self.pitch_um
 
     @property
-    def unit_axes(self) -> tuple[np.ndarray, np.ndarray]:
+    def unit_axes(self) -> tuple[Array, Array]:
         """(y, x) coordinates from −1 to 1 over the scan, broadcastable."""
         return np.linspace(-1, 1, self.shape[0])[:, None], np.linspace(-1, 1, self.shape[1])[None, :]
 
 
 def place_scan(
-    layout_shape: tuple[int, int],
+    layout_shape: Shape,
     pitch_um: float,
     microscope: Microscope,
     rng: np.random.Generator,
@@ -73,8 +72,8 @@ def place_scan(
 
 
 def sample_surface(
-    surface: np.ndarray, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
-) -> np.ndarray:
+    surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
+) -> Array:
     """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
@@ -108,7 +107,7 @@ def _whole_pixel_corner(frame: ScanFrame) -> tuple[int, int] | None:
     return int(whole[1]) + GUARD_PX, int(whole[0]) + GUARD_PX
 
 
-def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> np.ndarray:
+def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
     """Random second-order polynomial without its affine part, unit rms on average."""
     y, x = frame.unit_axes
     c = rng.standard_normal(3)

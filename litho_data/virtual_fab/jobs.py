@@ -1,7 +1,5 @@
 """The fields of a run: random layouts in print blocks, and the reference scans of a noise analysis."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,8 +9,10 @@ from typing import cast
 import numpy as np
 
 from litho_data.cards.card import Use, load_card
+from litho_data.cards.listing import files_by_id
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Shape
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job
@@ -39,7 +39,7 @@ class Plan:
     """
 
     count: int = 12
-    size_px: tuple[int, int] = (256, 256)
+    size_px: Shape = (256, 256)
     fields_per_print: int = 4
     cutoffs_per_um: tuple[float, ...] = (0.25, 0.5)
     write_field_um: float | None = None
@@ -88,7 +88,7 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
         yield from _reference_jobs(plan, printer)
 
 
-def _field_position_um(plan: Plan, printer: Printer, field: int) -> tuple[float, float]:
+def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
     """(y, x) centre of a field in the shared write field: a square block, row by row."""
     if plan.write_field_um is None:
         return 0.0, 0.0
@@ -141,20 +141,17 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
         )
     folder = Path(path).parent
     table = read_table(folder / card.ids.table) if card.ids.table else {}
-    if not isinstance(card.layout.files, str):
-        raise InputError(f"layouts of card {path}", got="several patterns", wanted="one")
-    before, after = card.layout.files.split("{id}", 1)
-    files = sorted(folder.glob(f"{before}*{after}"))
+    files = files_by_id(folder, card.layout.files)
     if not files:
         raise InputError(f"layouts of card {path}", got="none", wanted=card.layout.files)
-    ids = [file.relative_to(folder).as_posix().removeprefix(before).removesuffix(after) for file in files]
+    ids = sorted(files, key=lambda one: files[one][0])
     rank = {scan_id: int(table.get(scan_id, {}).get("order", place)) for place, scan_id in enumerate(ids)}
     spread = max(1, len(ids) - 1)
     jobs: list[Job] = []
     printed: dict[tuple[str, bytes], tuple[int, float]] = {}
     for index, scan_id in enumerate(sorted(ids, key=rank.__getitem__)):
         row = table.get(scan_id, {})
-        level = read_layout(folder / f"{before}{scan_id}{after}")
+        level = read_layout(files[scan_id][0])
         match = re.fullmatch(card.ids.print, scan_id) if card.ids.print else None
         block = match["print"] if match and any(name in row for name in SCANNING) else scan_id
         place = index / spread - 0.5 if len(ids) > 1 else 0.0

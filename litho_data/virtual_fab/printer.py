@@ -1,12 +1,11 @@
 """One print from layout to dry surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
 from litho_data.cards.card import Use
+from litho_data.foundation.kinds import YX, Array
 from litho_data.virtual_fab.canvas import Canvas, frame_layout, gaussian_transfer
 from litho_data.virtual_fab.exposure import accumulate_dose
 from litho_data.virtual_fab.geometry import ScanFrame
@@ -42,11 +41,11 @@ class Job:
     """
 
     id: str
-    level: np.ndarray
+    level: Array
     index: int = 0
     order: float = 0.0
     dose: float = 1.0
-    field_um: tuple[float, float] = (0.0, 0.0)
+    field_um: YX = (0.0, 0.0)
     write_field_um: float | None = None
     use: Use = "dataset"
     grating_um: float | None = None
@@ -74,20 +73,20 @@ class Cause:
     and scanned more than once.
     """
 
-    def on_dose(self, dose: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
         """The two-photon dose on the canvas, 1 = full, never negative."""
         return dose
 
-    def on_surface(self, surface_um: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
         """The dry surface on the canvas, without roughness, µm."""
         return surface_um
 
-    def on_scan(self, height_um: np.ndarray, frame: ScanFrame, job: Job) -> np.ndarray:
+    def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
         """The true surface at the pixels of the scan, before the microscope's own errors, µm."""
         return height_um
 
 
-def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> np.ndarray:
+def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> Array:
     """Surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
     cause = cause or Cause()
     canvas = job.canvas(printer.pitch_um)
@@ -109,7 +108,7 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
     return cause.on_surface(height, canvas, job)
 
 
-def _bars(at_um: np.ndarray, period_um: float) -> np.ndarray:
+def _bars(at_um: Array, period_um: float) -> Array:
     """1 on bars of half a period, 0 between them, straight flanks."""
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
@@ -117,7 +116,7 @@ def _bars(at_um: np.ndarray, period_um: float) -> np.ndarray:
 
 def surface_noise(
     job: Job, printer: Printer, noise: Noise, knobs: KnobBoard, rng: np.random.Generator
-) -> np.ndarray:
+) -> Array:
     """Roughness of the surface, on the canvas, µm."""
     canvas = job.canvas(printer.pitch_um)
     shape = canvas.level.shape

@@ -1,9 +1,8 @@
 """Random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
 
-from __future__ import annotations
-
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
 # The spectrum of the measured prints' fine residual: a band of line-shaped features across the
@@ -17,12 +16,12 @@ _ALONG_UM = 1.2
 _SMOOTH_UM = 0.06
 
 
-def line_roughness(shape: tuple[int, int], pitch_um: float, rng: np.random.Generator) -> np.ndarray:
+def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
     """Line-shaped roughness along x with unit variance on average, shape (ny, nx)."""
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
 
-def line_roughness_psd(shape: tuple[int, int], pitch_um: float) -> np.ndarray:
+def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
     """Power spectrum of `line_roughness` on the half plane, arbitrary units."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     band = np.exp(-((np.abs(frequency_y) - _BAND_PER_UM) ** 2) / (2 * _BAND_WIDTH_PER_UM**2))
@@ -34,7 +33,7 @@ def line_roughness_psd(shape: tuple[int, int], pitch_um: float) -> np.ndarray:
     return across * along
 
 
-def gaussian_field(psd: np.ndarray, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
     """Gaussian random field of a power spectrum given on the half plane; unit variance on average."""
     # Columns other than 0 and the Nyquist one stand for two frequencies of the full plane.
     doubled = np.full(psd.shape[1], 2.0)
@@ -45,7 +44,7 @@ def gaussian_field(psd: np.ndarray, rng: np.random.Generator, shape: tuple[int, 
     return apply_transfer(rng.standard_normal(shape), np.sqrt(psd / mean_power))
 
 
-def perlin_curve(position_um: np.ndarray, period_um: float, rng: np.random.Generator) -> np.ndarray:
+def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator) -> Array:
     """One-dimensional Perlin noise within ±1, same shape as ``position_um``."""
     slopes = rng.uniform(-1, 1, 1024)
     cell, inside = np.divmod(position_um / period_um, 1.0)
@@ -56,7 +55,7 @@ def perlin_curve(position_um: np.ndarray, period_um: float, rng: np.random.Gener
     return 2 * ((1 - fade) * slopes[left] * inside + fade * slopes[right] * (inside - 1))
 
 
-def smooth_map(y_um: np.ndarray, x_um: np.ndarray, period_um: float, rng: np.random.Generator) -> np.ndarray:
+def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
     """Random sum of eight plane waves of about one period each, unit variance on average."""
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)

@@ -1,10 +1,9 @@
 """Resist and development: conversion, diffusion, shrinkage, and what is lost or left behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 
+from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab.canvas import Canvas, blur
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.random_curves import perlin_curve, smooth_map
@@ -13,7 +12,7 @@ from litho_data.virtual_fab.settings import Printer
 _NARROW_UM = 1.5
 
 
-def develop(dose: np.ndarray, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.ndarray:
+def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
     """Height of the developed, dried print above the zero of the scans, µm.
 
     A column of resist converts along a logistic curve of its dose. On drying, it shrinks less in a denser
@@ -44,17 +43,17 @@ def develop(dose: np.ndarray, canvas: Canvas, printer: Printer, knobs: KnobBoard
     return height + printer.base_um
 
 
-def _convert(dose: np.ndarray, printer: Printer, extra_steepness: float) -> np.ndarray:
+def _convert(dose: Array, printer: Printer, extra_steepness: float) -> Array:
     """Logistic conversion, shifted and scaled to be 0 without dose and 1 at full dose."""
     steepness = printer.threshold_steepness * (1 + extra_steepness)
 
-    def logistic(at: np.ndarray | float) -> np.ndarray:
+    def logistic(at: Array | float) -> Array:
         return 1 / (1 + np.exp(-steepness * (np.asarray(at) - printer.threshold_dose)))
 
     return (logistic(dose) - logistic(0.0)) / (logistic(1.0) - logistic(0.0))
 
 
-def _field_shape(canvas: Canvas, knobs: KnobBoard) -> np.ndarray:
+def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
     """Tilt and bow over the write field, 1 at the highest corner."""
     rng = knobs.machine_rng("field-curvature")
     y_um, x_um = canvas.field_offset_um()
@@ -64,9 +63,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> np.ndarray:
     return shape / (abs(tilt_y) + abs(tilt_x) + abs(bow))
 
 
-def _shrink(
-    height: np.ndarray, conversion: np.ndarray, canvas: Canvas, printer: Printer, knobs: KnobBoard
-) -> np.ndarray:
+def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
     """Shrinkage beyond that of plain drying."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
@@ -83,7 +80,7 @@ def _shrink(
     return height
 
 
-def _lose_and_leave(height: np.ndarray, canvas: Canvas, knobs: KnobBoard) -> np.ndarray:
+def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
     """What capillary forces and the developer do to narrow features and steep flanks."""
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from litho_data.foundation.errors import require_known
+from litho_data.foundation.kinds import Shape
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Preset:
     """
 
     count: int
-    size_px: int | tuple[int, int]
+    size_px: int | Shape
     fields_per_print: int = 4
     knobs: tuple[str, ...] = ()
     printer: Printer = Printer()

@@ -1,7 +1,5 @@
 """A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth apart."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -10,15 +8,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from litho_data.cards.card import load_card
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.foundation.kinds import YX, Shape
+from litho_data.layouts.card_text import CARD_NAME, CardText, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
-from litho_data.virtual_fab.jobs import PRINT_PATTERN, SCANNING, Plan, random_jobs
+from litho_data.virtual_fab.jobs import PRINT_PATTERN, SCANNING, Plan, jobs_of_card, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
@@ -31,7 +31,7 @@ def simulate(
     out: str | Path,
     *,
     count: int = 12,
-    size_px: int | tuple[int, int] = 256,
+    size_px: int | Shape = 256,
     seed: int = 0,
     knobs: Iterable[KnobSetting | str] = (),
     cause: Cause | None = None,
@@ -186,7 +186,7 @@ def _write_card(
     raw: Path,
     fab: Fab,
     name: str,
-    size_um: tuple[float, float],
+    size_um: YX,
     rows: list[tuple[object, ...]],
     metadata: str,
     write_field_um: float | None,
@@ -229,4 +229,42 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
         scan_shape=scan.frame.shape,
         scan_to_layout=[[float(value) for value in row] for row in scan.frame.scan_to_layout],
         **noise_floor(scan.height_um - scan.noiseless_um),
+    )
+
+
+def simulate_plan(
+    plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1, cause: Cause | None = None
+) -> Path:
+    """Print and scan a plan in the fab of an earlier run; returns the path of the new card.
+
+    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is a new one: what
+    is drawn for single prints and scans is drawn afresh.
+
+    Args:
+        plan: folder with ``card.toml``, layouts and ``scans.csv``, as `litho-models next-print` writes it.
+        fab: folder of the earlier run, with its ``truth``.
+        out: where ``raw`` and ``truth`` of the new run go.
+        seed: of the new draws; another than the earlier run's.
+        cause: what that run had beside its knobs.
+
+    Raises:
+        InputError: no plan, no truth, the seed of the earlier run, or layouts that its printer cannot write.
+    """
+    card = Path(plan) / CARD_NAME
+    truth = Truth.read(Path(fab) / "truth")
+    if seed == truth.seed:
+        raise InputError("seed", got=seed, wanted="another than the earlier run's: the prints are new")
+    about = load_card(card)
+    return simulate(
+        out,
+        jobs=jobs_of_card(card, first=len(truth.scans), printer=truth.printer),
+        seed=seed,
+        knobs=[knob.setting for knob in truth.knobs],
+        cause=cause,
+        noise=truth.noise,
+        microscope=truth.microscope,
+        printer=truth.printer,
+        name=about.name,
+        print_pattern=about.ids.print or "",
+        plan_of=about.plan.dataset_sha256 if about.plan else "",
     )

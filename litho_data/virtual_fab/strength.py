@@ -1,7 +1,5 @@
 """The size of an effect in the data, and the strength for a given size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
@@ -125,7 +124,7 @@ def knob_rms_nm(
     return float(1e3 * np.sqrt(np.mean(mean_squares)))
 
 
-def free_of_nuisances(change: np.ndarray, prediction: np.ndarray, policy: Policy) -> np.ndarray:
+def free_of_nuisances(change: Array, prediction: Array, policy: Policy) -> Array:
     """``change`` minus its least-squares fit by the terms of the policy, same shape."""
     if policy == "none":
         return change
@@ -147,6 +146,6 @@ def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 
 
-def _noise_free(job: Job, knobs: Sequence[KnobSetting], printer: Printer | None) -> np.ndarray:
+def _noise_free(job: Job, knobs: Sequence[KnobSetting], printer: Printer | None) -> Array:
     fab = Fab(printer or Printer(), Microscope.aligned(), Noise.off(), KnobBoard(knobs, 0), 0)
     return scan_job(fab, job).noiseless_um

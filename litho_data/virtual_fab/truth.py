@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
@@ -49,7 +50,7 @@ class ScanTruth(Record):
     use: str
     dose: float
     order: float
-    field_um: tuple[float, float]
+    field_um: YX
     scan_shape: tuple[int, int]
     scan_to_layout: list[list[float]]
     datum_nm: float
@@ -77,7 +78,7 @@ class Truth(Result):
     scans: list[ScanTruth]
 
 
-def noise_floor(noise_um: np.ndarray) -> dict[str, float]:
+def noise_floor(noise_um: Array) -> dict[str, float]:
     """Size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow, nm."""
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = centred_nm - quadratic_surface(centred_nm)
@@ -90,7 +91,7 @@ def noise_floor(noise_um: np.ndarray) -> dict[str, float]:
     }
 
 
-def quadratic_surface(field: np.ndarray) -> np.ndarray:
+def quadratic_surface(field: Array) -> Array:
     """Least-squares surface of {1, x, y, x², xy, y²}, same shape as ``field``."""
     # Legendre products are nearly orthogonal on the grid, which keeps the normal equations well conditioned.
     y, x = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 2) for size in field.shape)

@@ -12,7 +12,13 @@ from litho_data.foundation.app import DaskOption, WorkersOption
 
 
 def close_loop(
-    store: Annotated[Path, typer.Argument(help="dataset store made by litho-data build")],
+    stores: Annotated[
+        list[Path],
+        typer.Argument(
+            help="dataset store made by litho-data build; further stores, later prints of the same printer, "
+            "decide what the first leaves open"
+        ),
+    ],
     out: Annotated[
         Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
     ],
@@ -51,11 +57,12 @@ def close_loop(
 
     Example: litho-models close-loop prints.zarr --out loop
     """
-    from litho_models.twin.report import effect_text, verdict_text
+    from litho_models.twin.report import decision_text, effect_text, verdict_text
 
     result = litho_models.close_loop(
-        store,
+        stores[0],
         out,
+        new_prints=stores[1:],
         base=base,
         folds=folds,
         nested=nested,
@@ -71,4 +78,6 @@ def close_loop(
     typer.echo(verdict_text(result))
     for one in result.effects:
         typer.echo(f"  {effect_text(one)}")
+    for decision in result.decisions:
+        typer.echo(f"  {decision_text(decision)}")
     typer.echo(f"report: {out / 'report.html'}")

@@ -7,7 +7,7 @@ other scan. Whatever is judged on scans is chosen without them by calling it on 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -170,44 +170,40 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
     found = search(start, study, candidates)
     failed: list[Checked] = []
     learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
-    while True:
-        left = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2 if learner else 0.0
-        without = {
-            cause.name: fit_state(found.state.twin.without(cause.name), study) for cause in found.causes
-        }
-        found.causes = [
-            replace(cause, judgement=judge(without[cause.name].freed_nm2, found.state.freed_nm2, study))
-            for cause in found.causes
-        ]
-        checked = [
-            Checked(
-                cause,
-                reshaped_gain(without[cause.name], found.state, study),
-                left,
-                _larger(cause, found, without, study),
-            )
-            for cause in found.causes
-        ]
+    while learner and found.causes:
+        left_nm2 = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2
+        checked = [_checked(cause, found, left_nm2, study) for cause in found.causes]
+        found.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
         wrong = sorted(
             (one for one in checked if not one.holds), key=lambda one: (not one.corrects, one.gain_nm2)
         )
         if not wrong:
             return found, [*checked, *failed]
-        study.report(f"{wrong[0].cause.name}: {wrong[0].reason}")
+        name, reason = wrong[0].cause.name, wrong[0].reason
+        study.report(f"{name}: {reason}")
         failed.append(wrong[0])
-        found.refused[wrong[0].cause.name] = wrong[0].reason
-        found.causes = [cause for cause in found.causes if cause.name != wrong[0].cause.name]
-        found.state = without[wrong[0].cause.name] if found.causes else start
+        found.refused[name] = reason
+        found.causes = [cause for cause in found.causes if cause.name != name]
+        found.state = found.state.without(name, study) if found.causes else start
+    return found, failed
 
 
-def _larger(cause: Cause, found: Found, without: Mapping[str, State], study: Study) -> str:
+def _checked(cause: Cause, found: Found, left_nm2: float, study: Study) -> Checked:
+    """A cause, judged with all others in place."""
+    without = found.state.without(cause.name, study)
+    cause = replace(cause, judgement=judge(without.freed_nm2, found.state.freed_nm2, study))
+    reshaped_nm2 = reshaped_gain(without, found.state, study)
+    return Checked(cause, reshaped_nm2, left_nm2, _larger(cause, found, study))
+
+
+def _larger(cause: Cause, found: Found, study: Study) -> str:
     """A much larger cause whose change in another shape takes what this one does; empty if none."""
-    gain = cause.judgement.gain_nm2
+    gain, without = cause.judgement.gain_nm2, found.state.without(cause.name, study)
     for other in found.causes:
         if gain < SMALL_SHARE * other.judgement.gain_nm2:
-            neither = fit_state(without[cause.name].twin.without(other.name), study)
-            if reshaped_gain(neither, without[cause.name], study) >= REPEATED_SHARE * gain:
+            neither = without.without(other.name, study)
+            if reshaped_gain(neither, without, study) >= REPEATED_SHARE * gain:
                 return other.name
     return ""
 
@@ -237,20 +233,21 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
 
 
 def fit_with_measurement(
-    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, fold: int | None = None
+    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, fold: int | None = None, refit: bool = True
 ) -> tuple[Twin, MeasurementModel]:
     """Printer and measurement fitted to the same scans, one after the other and once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
         fold: that a base which was trained without each fold must not have seen.
+        refit: the printer, once the measurement is known; or leave it where it is.
     """
     stored = [scan.stored for scan in scans]
     placed = twin.placed()
     maps = [placed.height(scan, fold) for scan in scans]
     learned = learn_measurement(stored, maps, seed=seed)
-    freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
-    if len(twin.vector):
+    if refit and len(twin.vector):
+        freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)
         placed = twin.placed()

@@ -90,7 +90,7 @@ class HeldOut:
         self.closed, self.settings = closed, settings
         self.scans = [one.stored for one in closed.original]
         # With its state, which must outlive its entry: the number of one that is gone may come again.
-        self._known: dict[int, tuple[State, tuple[Maps, tuple[int, int]]]] = {}
+        self._known: dict[tuple[int, bool], tuple[State, tuple[Maps, tuple[int, int]]]] = {}
 
     @property
     def stages(self) -> dict[Stage, State]:
@@ -134,10 +134,10 @@ class HeldOut:
     def left_out_nm(self) -> dict[str, float]:
         """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
         model, found = self.closed.final, {}
+        whole_nm = self._mae_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.settings.report(f"leaving out {name}")
-            without = fit_state(model.twin.without(name), self.closed.study)
-            found[name] = self._mae_nm(without) - self._mae_nm(model)
+            found[name] = self._mae_nm(model.without(name, self.closed.study)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -158,7 +158,7 @@ class HeldOut:
             bare = fit_state(Twin.bare(base, study.scans[0]), study)
             full = fit_state(final.twin.over(bare.twin.placed().base, study.scans[0]), study)
             for name, by in final.twin.by.items():
-                without = fit_state(full.twin.without(name), study)
+                without = full.without(name, study)
                 if judge(without.freed_nm2, full.freed_nm2, study).passed(grouped=by != ALL):
                     found[name].append(base_name)
         return found
@@ -167,7 +167,8 @@ class HeldOut:
         return ("base", self.closed.base), ("all", self.closed.final)
 
     def _mae_nm(self, state: State) -> float:
-        rows = self._rows("all", "shared", "scans", *self._by_fold(state))
+        """k = 1, the printer as it was fitted beside the others' measurement, which is learned anew."""
+        rows = self._rows("all", "shared", "scans", *self._by_fold(state, refit=False))
         return next(row.mae_nm for row in rows if row.policy == "offset")
 
     def _rows(
@@ -178,14 +179,16 @@ class HeldOut:
             seed=self.settings.seed,
         )  # fmt: skip
 
-    def _by_fold(self, state: State) -> tuple[Maps, tuple[int, int]]:
-        if id(state) not in self._known:
-            jobs = {fold: (state.twin.at(own), fold) for fold, own in enumerate(state.per_fold)}
-            self._known[id(state)] = state, self._without_parts(jobs, self.settings.fold_of.tolist())
-        return self._known[id(state)][1]
+    def _by_fold(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
+        key = id(state), refit
+        if key not in self._known:
+            starts = {fold: (state.twin.at(own), fold) for fold, own in enumerate(state.per_fold)}
+            found = self._without_parts(starts, self.settings.fold_of.tolist(), refit)
+            self._known[key] = state, found
+        return self._known[key][1]
 
     def _without_parts(
-        self, starts: Mapping[Any, tuple[Twin, int | None]], part_of: Sequence[Any]
+        self, starts: Mapping[Any, tuple[Twin, int | None]], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
         """Maps of all scans by fits without their part, and the most numbers that any of them took.
 
@@ -195,7 +198,7 @@ class HeldOut:
         original, jobs = self.closed.original, []
         for part, (twin, fold) in starts.items():
             rest = [scan for scan, own in zip(original, part_of, strict=True) if own != part]
-            jobs.append((part, twin, rest, self.settings.seed, fold))
+            jobs.append((part, twin, rest, self.settings.seed, fold, refit))
         done = run_jobs(_fit_part, jobs, self.settings.workers, name=lambda job: f"part {job[0]}")
         fits = {job[0]: fit for job, fit in done}
         maps = [
@@ -219,9 +222,8 @@ class HeldOut:
         return found
 
 
-def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, int | None]) -> Fit:
-    _, twin, scans, seed, fold = job
-    return Fit(*fit_with_measurement(twin, scans, seed, fold))
+def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, int | None, bool]) -> Fit:
+    return Fit(*fit_with_measurement(*job[1:]))
 
 
 def _expected(fit: Fit, scans: Sequence[PreparedScan], fold: int | None) -> list[np.ndarray]:

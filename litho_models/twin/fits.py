@@ -6,7 +6,7 @@ What single scans may add is projected out, so that it cannot pull the numbers o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -93,7 +93,6 @@ class State:
         twin: at the numbers fitted to all scans; ``per_fold``: (folds, p), each without its own scans.
         linear: each window at ``twin``: residual, derivatives, and what the scan may add by itself.
         held_out_um: residual (n,) of each window by the fit that has not seen it.
-        training: (folds,) weighted sum of squares of each fit on its own scans, µm².
         freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
     """
 
@@ -101,12 +100,19 @@ class State:
     per_fold: np.ndarray
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
-    training: np.ndarray
     freed_nm2: np.ndarray
+    # What it is without one of its effects: asked for by every step that judges the effect.
+    _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
+
+    def without(self, name: str, study: Study) -> State:
+        """The model without one of its effects, fitted again from here."""
+        if name not in self._without:
+            self._without[name] = fit_state(self.twin.without(name), study, from_here=True)
+        return self._without[name]
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
@@ -174,27 +180,31 @@ class TwinProblem:
         return self._twin.at(vector).room()
 
 
-def fit_state(twin: Twin, study: Study) -> State:
-    """Fit a twin to all windows of a study, then without each fold in turn, from where it stands."""
+def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
+    """Fit a twin to all windows of a study, then without each fold in turn.
+
+    Args:
+        from_here: begin where the twin stands, or else there or with the base as it is before any fit.
+    """
     windows = study.windows
-    fitted = fit_least_squares(TwinProblem(twin, windows), _best_start(twin, windows), RULES)
+    start = twin.vector if from_here else _best_start(twin, windows)
+    fitted = fit_least_squares(TwinProblem(twin, windows), start, RULES)
     common = twin.at(fitted.vector)
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
-    per_fold, training, held_out = [], [], [np.empty(0)] * len(windows)
+    per_fold, held_out = [], [np.empty(0)] * len(windows)
     freed = np.empty(len(windows))
     for fold in study.folds:
         own = [i for i, of in enumerate(study.fold_of) if of != fold]
-        vector, squares = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own], fold)
+        vector = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own], fold)
         per_fold.append(vector)
-        training.append(squares)
         placed = common.at(vector).placed()
         for i in np.flatnonzero(study.fold_of == fold):
             prediction = placed.height(windows[i], fold)
             held_out[i] = windows[i].height - windows[i].at_sample(prediction)
             left = without_terms(held_out[i][:, None], windows[i], prediction)
             freed[i] = NM_PER_UM**2 * float(np.mean(left**2))
-    return State(common, np.stack(per_fold), linear, held_out, np.array(training), freed)
+    return State(common, np.stack(per_fold), linear, held_out, freed)
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
@@ -221,14 +231,14 @@ def without_terms(
 
 def _without(
     common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan], fold: int
-) -> tuple[np.ndarray, float]:
-    """Numbers fitted to some of the windows with the derivatives of the common fit; weighted squares, µm².
+) -> np.ndarray:
+    """Numbers fitted to some of the windows with the derivatives of the common fit.
 
     The common fit, which has seen all windows, is where it starts: nothing may be left there.
     """
     vector = common.vector
     if not len(vector):
-        return vector, eliminated_sum(linear, RULES.term_weight)[2]
+        return vector
     if isinstance(common.base, FoldedBase):
         # At the common fit each window was predicted by a model that has seen the fold.
         left = TwinProblem(common, windows, fold).residuals(vector)
@@ -245,4 +255,4 @@ def _without(
         vector, gained, total = trial, total - squares, squares
         if gained <= _FOLD_GAIN * squares:
             break
-    return common.at(vector).known_from(windows).vector, total
+    return common.at(vector).known_from(windows).vector

@@ -28,6 +28,7 @@ CandidateVerdict = Literal[
     "too-few-scans",
 ]
 Stage = Literal["base", "causes", "all"]
+Decided = Literal["decided", "still open", "none of them", "not shown by these prints"]
 MeasuredBy = Literal["print alone", "published", "shared"]
 
 
@@ -154,12 +155,40 @@ class Explained(Record):
     matters: bool
 
 
+class Comparison(Record):
+    """Two answers on new prints: by how much the first is nearer, in nm² and in standard deviations.
+
+    ``z`` is less what the form of the model may have made of it; ``difference_nm``: between the two, rms.
+    """
+
+    better: str
+    worse: str
+    gain_nm2: float
+    z: float
+    difference_nm: float
+
+
+class Decision(Record):
+    """A question that was open, and what new prints say: the answers declared before, and those left."""
+
+    question: str
+    kind: str
+    declared: list[str]
+    left: list[str]
+    verdict: Decided
+    evidence: str
+    prints: int
+    scans: int
+    comparisons: list[Comparison] = Field(default_factory=list)
+
+
 class CloseLoop(Result):
     """What the loop found.
 
     ``errors``: see ``ErrorRow``; ``gain``: base minus all, k = 1, with the shared measurement, over scans and
     over prints. ``chosen``: in nested selections, how often each effect was chosen. ``confounded``: fitted
-    numbers that these scans determine together only, with their correlation.
+    numbers that these scans determine together only, with their correlation. ``decisions``: of further
+    stores, about what was open on the first.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -186,6 +215,7 @@ class CloseLoop(Result):
     measurement: MeasurementModel
     explained: list[Explained]
     chosen: dict[str, int] = Field(default_factory=dict)
+    decisions: list[Decision] = Field(default_factory=list)
     verdict: Verdict
     fewest_scans: int
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.record import CloseLoop, ErrorRow, FoundEffect, Planted, ScanFinding
+from litho_models.twin.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,6 +58,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
             "strengths.csv",
             digits=3,
         )
+    if result.decisions:
+        page.heading("What new prints decide")
+        page.points([decision_text(one) for one in result.decisions])
     page.heading("Where the residual lies")
     page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
     page.table(
@@ -132,6 +135,12 @@ def effect_text(one: FoundEffect) -> str:
         f"{one.name}{_by(one)}: {one.title}; {', '.join(sizes)}. It takes {one.gain_nm2:.0f} of "
         f"{one.before_nm2:.0f} nm² and is better on {better} of {count} held-out scans.{alike}{bases}"
     )
+
+
+def decision_text(one: Decision) -> str:
+    """What new prints say of a question."""
+    left = ", ".join(one.left) or "none"
+    return f"New prints on {one.question}: {one.verdict}, {left}. {capitalised(one.evidence)}."
 
 
 def measurement_text(result: CloseLoop) -> str:

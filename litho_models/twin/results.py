@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
-from litho_models.fitting.least_squares import eliminated
+from litho_models.fitting.least_squares import Linearised, eliminated
 from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.pairs import over_prints, over_scans
 from litho_models.simulator import Simulator
@@ -16,6 +16,7 @@ from litho_models.twin.closing import Closed
 from litho_models.twin.fits import RULES, State
 from litho_models.twin.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan
 from litho_models.twin.record import (
     Candidate,
     CandidateVerdict,
@@ -168,9 +169,8 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
             for parameter, facts in effect.parameters.items()
         }
     twin = state.twin
-    prints = [scan.stored.print_id for scan in closed.study.scans]
-    units = prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in closed.study.scans]
-    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state, units)), 0.0))
+    units = independent(closed.study.scans)
+    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state.linear, units)), 0.0))
     reach = float(t.ppf(0.975, max(len(set(units)) - 1, 1)))
     found: dict[str, list[Strength]] = {}
     for at, slot in enumerate(twin.slots, twin.own):
@@ -191,11 +191,19 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
     return found
 
 
-def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
-    """Covariance (p, p) of the fitted numbers, by what each unit asks for at the optimum."""
-    if not len(state.twin.vector):
-        return np.empty((0, 0))
-    parts = [eliminated(part, RULES.term_weight) for part in state.linear]
+def independent(scans: Sequence[PreparedScan]) -> list[str]:
+    """The unit that each scan belongs to in an interval: its print, or itself where prints are too few."""
+    prints = [scan.stored.print_id for scan in scans]
+    return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
+
+
+def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
+    """Covariance (p, p) of fitted numbers, by what each unit asks for at the optimum.
+
+    Args:
+        linear: each window there; ``units``: the print, or the scan, that each belongs to.
+    """
+    parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
     inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
     names = sorted(set(units))

@@ -13,6 +13,7 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
@@ -30,8 +31,11 @@ from litho_models.twin.results import record
 from litho_models.twin.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
 from litho_models.twin.single_scans import SingleScans
 
+QUESTIONS_FILE = "open_questions.json"
 _FEWEST_PIXELS = 1024
 Nested = Literal["folds", "prints"]
+# What is made of a closed loop before it is written: its record, and records to be written beside it.
+Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
 
 
 def close_loop(
@@ -48,6 +52,7 @@ def close_loop(
     seed: int = 0,
     workers: int = 1,
     dask: str | None = None,
+    further: Further | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
@@ -63,13 +68,16 @@ def close_loop(
         cache: folder where such trainings are kept and continued, by default beside ``out``.
         seed: of folds, calibration blocks and permutations.
         workers: local processes; ``dask``: address of a Dask scheduler instead.
+        further: called before anything is written.
         report: told what happens, a sentence at a time.
 
     Raises:
         InputError: no store, an unknown base, too few usable scans, or a nested selection of a base that is
             not fitted here.
     """
-    require_replaceable_folder(out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
+    require_replaceable_folder(
+        out, CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE
+    )
     for text in inject:
         parse_planted(text)
     opened = open_store(store)
@@ -117,8 +125,10 @@ def close_loop(
         split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
         chosen=often,
     )  # fmt: skip
+    result, beside = further(closed, result) if further else (result, ())
     with atomic_folder(out) as folder:
-        result.write(folder)
+        for written in (result, *beside):
+            written.write(folder)
         write_report(result, held_out.residuals(), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
         save_laws(result, folder)

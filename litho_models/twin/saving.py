@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from litho_data.store import Store
+from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.simulator import Simulator
@@ -47,6 +48,7 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     assert isinstance(base, Simulator)
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
     values = twin.values(twin.labels(latest))
+    sides = {"process": "printer", "measurement": "microscope"}
     role = {one.name: one.role for one in result.effects}
     error = result.error("all")
     assert error is not None
@@ -60,6 +62,11 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
             name: own for name, own in values.items() if role[name] not in ("process", "measurement")
         },
         dataset=result.dataset.model_dump(mode="json"),
+        attributed={
+            one.name: sides[one.role]
+            for one in result.effects
+            if one.role in sides and get_effect(one.name).role != one.role
+        },
         command=result.run.command,
         split={
             **result.split.model_dump(mode="json"),

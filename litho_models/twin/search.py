@@ -222,7 +222,7 @@ def _defend(found: Found, study: Study) -> None:
         return
     for cause in list(found.causes):
         study.report(f"deciding once more on {cause.name}")
-        without = fit_state(found.state.twin.without(cause.name), study)
+        without = found.state.without(cause.name, study)
         judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
         at = found.causes.index(cause)
         if judgement.passed(grouped=cause.by != ALL):

@@ -92,7 +92,7 @@ class SingleScans:
         effect, own = get_effect(name), terms_of_effect(name)
         before, after = self.freed(accepted - own), self.freed(accepted | own)
         judgement = _as_variance(before, after, self.study)
-        values = self._coefficients(own, accepted | own)
+        values = self.coefficients(own, accepted | own)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
         # Where scans of one print are alike, the printer may have done it too.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
@@ -109,7 +109,7 @@ class SingleScans:
             },
         )
 
-    def _coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
+    def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
         """(scans, k) of ``own`` terms, fitted beside all ``terms``; displacements in µm."""
         found = []
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):

@@ -22,8 +22,7 @@ from litho_data.build.operations import no_recipe
 from litho_data.build.result import BuildResult, report_folder
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.history import read_steps
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import read_steps, replay
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.access import values_of

@@ -17,8 +17,7 @@ from litho_data.build.operations import no_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.history import history
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import history, replay
 from litho_data.roughness import axis_scales, find_step, find_wave
 from litho_data.tip.radius import peak_radius
 from tests.litho_data.campaigns import MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan

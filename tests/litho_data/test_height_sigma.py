@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data import open_store
 from litho_data.build.build import build_dataset
 from litho_data.build.height_sigma import height_sigma
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import replay
 from litho_data.register.flows import LADDER, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, solve_gram

@@ -338,7 +338,7 @@ def test_rotation_brings_a_plane_to_a_constant_and_keeps_shape() -> None:
             lambda z: level_facet(z, pitch_um=PITCH_UM, mask=np.indices(z.shape).sum(0) % 2 == 0),
             "facet levelling",
         ),
-        (lambda z: align_rows(z, method="mode"), "row alignment method"),
+        (lambda z: align_rows(z, method="mode"), "align-rows, got method"),
         (lambda z: align_rows(z, degree=6), "degree"),
         (lambda z: align_rows(z, trim=0.6), "trim"),
         (lambda z: align_rows(z, method="facet-tilt"), "pitch"),

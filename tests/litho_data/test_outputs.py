@@ -68,17 +68,17 @@ def test_a_result_of_other_settings_is_not_replaced(name: str, campaign: Path, t
     assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == held
 
 
-def test_settings_are_compared_where_an_older_result_has_them(tmp_path: Path) -> None:
+def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> None:
     record = tmp_path / "plan.json"
     now = {"dataset": {"name": "a"}, "settings": {"prints": 4, "sizes": (1, 2), "cache": None}}
     require_same_settings(tmp_path, "plan.json", now)
     for settings, differs in (
         ({"prints": 4, "sizes": [1, 2], "cache": None}, ""),
-        ({"prints": 4}, ""),
-        (None, ""),
+        ({"prints": 4}, "settings, sizes, wanted"),
+        (None, "settings, prints, wanted"),
         ({"prints": 3, "sizes": [1, 2]}, "prints = 3 where now 4 is asked"),
         ({"prints": 4, "sizes": [1, 3]}, "sizes, wanted"),
-        ({"prints": 4, "cache": 1}, "cache = 1 where now None"),
+        ({"prints": 4, "sizes": [1, 2], "cache": 1}, "cache = 1 where now None"),
     ):
         record.write_text(json.dumps({"dataset": {"name": "a"}, "settings": settings}))
         if not differs:

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from litho_data.build.build import build_dataset
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import replay
 from litho_data.provenance.verify import verify
 from litho_data.register import apply_transform
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine

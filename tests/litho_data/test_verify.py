@@ -10,8 +10,7 @@ import pytest
 import zarr
 
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.history import history
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import history, replay
 from litho_data.provenance.verify import verify
 from litho_data.store.access import array_of, values_of
 

@@ -103,10 +103,10 @@ def test_the_report_shows_the_result_in_words_tables_and_pictures(result):
     )
     assert all(f">{scan_id}<" in page for scan_id in [*record.split.scored_ids, *MODELS])
     assert all(f">{scores.mae_abs_nm:.2f}<" in page for scores in record.scores)
-    # Errors, one scan as maps and as a profile, gains of prints, levels, frequencies; each wide and narrow.
+    # Errors, one scan as maps and as a profile, gains of prints, levels, frequencies.
     # tests/test_reports.py looks at such in a browser.
     pictures = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", page)
-    assert len(pictures) == 12
+    assert len(pictures) == 6
     for picture in pictures:
         assert ElementTree.fromstring(base64.b64decode(picture)).tag.endswith("svg")
 

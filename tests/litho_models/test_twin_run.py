@@ -262,7 +262,7 @@ def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
         study = study_of(planted(seed=seed))
         state = bare_state(study)
         fitted.append(state.twin.vector[0])
-        sds.append(np.sqrt(clustered_covariance(state, [scan.id for scan in study.scans])[0, 0]))
+        sds.append(np.sqrt(clustered_covariance(state.linear, [scan.id for scan in study.scans])[0, 0]))
     # A spread of 12 draws is known to a fifth, twice that is allowed for.
     assert np.std(fitted, ddof=1) == pytest.approx(np.mean(sds), rel=0.45)
 

@@ -1,0 +1,94 @@
+"""What an operation of a recipe is: a function whose signature states its parameters, defaults and limits."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
+from typing import Any, ClassVar, Literal, TypeVar, cast
+
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation.results import first_error
+from litho_data.level.selection import MaskedLevelling, Masking
+
+F = TypeVar("F", bound=Callable[..., Any])
+STEPS: "dict[str, type[Step]]" = {}
+"""The steps that a recipe can hold, by operation."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What passes from step to step: heights (µm), the current mask, pitch and layout."""
+
+    height_um: Array
+    mask: Array | None
+    pitch_um: YX | None
+    layout_level: Array | None
+
+
+class Step(BaseModel):
+    """Base of all steps: its fields are the arguments of an operation.
+
+    ``masking`` says how the current mask is used: the mask of the scan at first, then that of the
+    latest step that marks something.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    function: ClassVar[Callable[..., Any]]
+    # What the operation takes of the state, and whether it can do without.
+    takes: ClassVar[dict[str, bool]]
+
+    op: str
+    masking: Masking = "exclude"
+
+    def run(self, state: State) -> State:
+        """The state with the levelled map, or with what was marked as its mask, or with both."""
+        arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
+        for name, optional in self.takes.items():
+            arguments[name] = getattr(state, name)
+            if arguments[name] is None and not optional:
+                wanted = "the pixel pitch" if name == "pitch_um" else "the layout in the scan's frame"
+                raise InputError(f"{wanted} is unknown", wanted=name)
+        made = type(self).function(state.height_um, **arguments)
+        if isinstance(made, Array):
+            return replace(state, mask=made)
+        levelled, mask = made if isinstance(made, MaskedLevelling) else (made, state.mask)
+        return replace(state, height_um=levelled.height, mask=mask)
+
+
+def operation(op: str, base: type[Step] = Step) -> Callable[[F], F]:
+    """Make a function of a height map the operation of that name, and check the arguments of every call.
+
+    Keyword arguments that ``State`` has are taken from there; all others are the fields of the step. The
+    function returns a ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
+    """
+
+    def made(function: F) -> F:
+        _, *parameters = inspect.signature(function, eval_str=True).parameters.values()
+        fields: dict[str, Any] = {"op": (Literal[op], op)}
+        takes = {}
+        for one in parameters:
+            required = one.default is one.empty
+            if one.name in State.__dataclass_fields__:
+                takes[one.name] = not required
+            elif one.name != "masking":
+                fields[one.name] = one.annotation, ... if required else one.default
+        step = create_model(op, __base__=base, **fields)
+        step.function, step.takes = staticmethod(function), takes
+        STEPS[op] = step
+
+        @wraps(function)
+        def checked(height: Array, **arguments: Any) -> Any:
+            stated = {name: value for name, value in arguments.items() if name not in takes}
+            try:
+                step(op=op, **stated)
+            except ValidationError as error:
+                raise InputError(op, got=first_error(error)) from error
+            return function(height, **arguments)
+
+        return cast(F, checked)
+
+    return made
