@@ -36,7 +36,6 @@ RESULTS = {
         for seed in TRAINING_SEEDS
     },
     "noise.json": "noise/noise.json",
-    "close_loop.json": "close-loop/close_loop.json",
 }
 PAGES = {
     ROOT / "README.md": "headline",

@@ -8,7 +8,6 @@ commands, printed as it runs. A step whose result exists is skipped, so an inter
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import subprocess
@@ -16,10 +15,10 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.foundation.report import Page
+from litho_models.twin.record import CloseLoop
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
@@ -27,7 +26,6 @@ CARDS = Path(__file__).parents[1] / "datasets"
 PAPER_SEEDS = (0, 1, 2, 3)
 # On whole prints the networks would take as long again as all the rest.
 BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random-features"
-SMALL_BASES = ("affine-mtf", "blur-table")
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
     if dataset:
         card = CARDS / f"{dataset}.toml"
         source = Step("Find or fetch the measured prints", _data("fetch", dataset), out / ".always")
-        prior = ["--prior", "datum-offset,tilt-bow,scan-line-stripes,registration-residual,slope-thinning"]
-        scored = ["--background", "training", "--open-lock-box"]
+        anew = ["--nested", "prints"]
     else:
         card = out / "fab" / "raw" / "card.toml"
         source = Step(
@@ -114,7 +111,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
             _data("simulate", "--preset", "demo", "--out", card.parents[1]),
             card,
         )
-        prior, scored = [], []
+        anew = []
     training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
         source,
@@ -135,24 +132,14 @@ def plan(out: Path, dataset: str) -> list[Step]:
         ),
         Step(
             "Close the loop: what does the model lack?",
-            _models("close-loop", store, "--base", "physics", *scored, *prior, "--out", loop),
+            _models("close-loop", store, *anew, "--out", loop),
             loop / "close_loop.json",
             loop / "report.html",
         ),
     ]  # fmt: skip
     if dataset:
-        network, noise = out / "close-loop-pbl", out / "noise"
+        noise = out / "noise"
         steps += [
-            *(
-                Step(
-                    f"What does {base} lack?",
-                    _models("close-loop", store, "--base", base, "--background", "training", *prior,
-                            "--out", out / f"close-loop-{base}"),
-                    out / f"close-loop-{base}" / "close_loop.json",
-                    out / f"close-loop-{base}" / "report.html",
-                )
-                for base in SMALL_BASES
-            ),
             *(
                 _paper_split(store, effort.models, out / f"benchmark-paper-{seed}", seed)
                 for seed in PAPER_SEEDS
@@ -171,15 +158,6 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 _models("noise", store, "--residuals", out / "benchmark", "--out", noise),
                 noise / "noise.json",
                 noise / "report.html",
-            ),
-            Step(
-                "What does the network lack?",
-                _models(
-                    "close-loop", store, "--base", "pbl", "--folds", effort.folds, *training,
-                    "--cache", out / "benchmark" / "cache", *scored, *prior, "--out", network,
-                ),
-                network / "close_loop.json",
-                network / "report.html",
             ),
         ]  # fmt: skip
     for model in effort.arms:
@@ -252,20 +230,14 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     if (out / "fab").exists():
         tell(page, out)
     else:
-        loop = _read(out / "close-loop" / "close_loop.json")
-        page.tiles(
-            [
-                (
-                    f"{loop['before']['mae_datum_free_nm']:.2f} nm",
-                    "error of the base model on held-out scans, one term per scan free",
-                ),
-                (
-                    f"{loop['after']['mae_datum_free_nm']:.2f} nm",
-                    "with all that the loop added, the same term free",
-                ),
-                (", ".join(e["name"] for e in loop["effects"]) or "none", "effects found"),
-            ]
-        )
+        loop = CloseLoop.read(out / "close-loop")
+        rows = {"the base model": loop.error("base"), "what the loop found": loop.error("all")}
+        tiles = [
+            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans, one term per scan free")
+            for name, row in rows.items()
+            if row is not None
+        ]
+        page.tiles([*tiles, (", ".join(one.name for one in loop.effects) or "none", "found")])
     page.heading("All reports")
     page.links([(os.path.relpath(s.report, out), s.title) for s in steps if s.report])
     page.heading("What was run", folded=True)
@@ -274,10 +246,6 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     )
     page.table(table, "0 s: the result was there from an earlier run.", "steps.csv", digits=1)
     return page.write(out, "index.html")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _spell(command: tuple[str, ...]) -> str:

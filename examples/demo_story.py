@@ -19,7 +19,7 @@ from litho_design.reports.parts import BRIGHTEST
 from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
 from litho_models.evaluation.wording import benchmark_verdict
-from litho_models.loop.result.record import CloseLoop
+from litho_models.twin.record import CloseLoop, FoundEffect
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,21 +42,23 @@ def tell(page: Page, out: Path) -> None:
     gap = GapResult.read(out / "compare")
     units = {knob.name: "" if knob.unit == "1" else f" {knob.unit}" for knob in truth.knobs}
     planted = {knob.effect: f"{knob.name}, {knob.strength:g}{units[knob.name]}" for knob in truth.knobs}
-    found = [effect.name for effect in loop.effects if effect.name != ZERO]
+    found = [effect.name for effect in _causes(loop)]
+    found += [one.name for one in loop.single_scans if one.seen and one.name != ZERO]
     hit = [name for name in planted if name in found]
     psnr = {
         entry.arm: entry.judged["si_psnr_db"]
         for entry in gap.entries
         if entry.judge == FAB and entry.seed == gap.seeds[0]
     }
-    terms = loop.headline
-    assert terms is not None
-    less = 100 * (1 - terms.after.mae_nm / terms.before.mae_nm)
+    before, after = loop.error("base"), loop.error("all")
+    assert before is not None
+    assert after is not None
+    less = 100 * (1 - after.mae_nm / before.mae_nm)
     page.verdict(
         f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
         f"{': ' if hit else ''}{' and '.join(hit)}"
         f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
-        f"went from {terms.before.mae_nm:.1f} to {terms.after.mae_nm:.1f} nm, {abs(less):.0f} % "
+        f"went from {before.mae_nm:.1f} to {after.mae_nm:.1f} nm, {abs(less):.0f} % "
         f"{'less' if less >= 0 else 'more'}. A hologram designed through "
         f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it, and "
         f"{psnr['none']:.1f} dB designed without a model. One run, so nothing is said about chance."
@@ -70,17 +72,19 @@ def tell(page: Page, out: Path) -> None:
     page.paragraph(f"Found and planted: {', '.join(hit) or 'none'}. Planted and not found: "
                    f"{', '.join(name for name in planted if name not in found) or 'none'}."
                    f"{_width(loop)}")  # fmt: skip
-    page.figure(_gains(loop, set(planted)), "What each effect takes off the error; blue if it was planted.")
+    page.figure(
+        _gains(loop, set(planted)), "How much larger the error is without each cause; blue if it was planted."
+    )
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
     page.heading("3. The error before and after, at equal freedom")
-    over = terms.over_scans
+    over = loop.over_scans
     interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, resampling scans)".format(*over.ci95_nm)
     page.paragraph(
         f"Mean absolute error of {over.count} scans, each predicted without being fitted to, "
-        f"with {terms.before.k:g} term per scan free before and {terms.after.k:g} after: "
-        f"{terms.gain_nm:.2f} nm less{interval}, better in {over.positive} of {over.count} scans."
+        f"with {before.k:g} term per scan free before and {after.k:g} after: "
+        f"{loop.gain_nm:.2f} nm less{interval}, better in {over.positive} of {over.count} scans."
     )
-    pairs = {"before": terms.before, "after": terms.after}
+    pairs = {"before": before, "after": after}
     page.figure(
         _bars({name: one.mae_nm for name, one in pairs.items()}, "error, nm", [OTHER, PLANTED]),
         "Before: the model as it was trained. After: with the effects that the loop found.",
@@ -106,13 +110,18 @@ def tell(page: Page, out: Path) -> None:
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
 
 
+def _causes(loop: CloseLoop) -> list[FoundEffect]:
+    """What the corrected model has; a description has no place in it."""
+    return [effect for effect in loop.effects if effect.knowledge != "description"]
+
+
 def _width(loop: CloseLoop) -> str:
     """How much wider the loop finds the spot along one direction, in the unit of the knob."""
     spot = next((effect for effect in loop.effects if effect.name == "elliptical-psf"), None)
     if spot is None:
         return ""
     # The moments grow by s² along one axis: Cxx - Cyy and 2 Cxy are s² cos 2a and s² sin 2a.
-    stretch, shear = (spot.parameters[name].value for name in ("stretch_um2", "shear_um2"))
+    stretch, shear = (spot.strengths[name][0].value for name in ("stretch_um2", "shear_um2"))
     return f" By the loop's own estimate the spot gains {math.hypot(stretch, shear) ** 0.5:.2f} µm."
 
 
@@ -130,14 +139,14 @@ def _first_scan(store: Path) -> Figure:
 
 
 def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
-    effects = [effect for effect in loop.effects if effect.name != ZERO]
+    effects = _causes(loop)
     figure = new_figure(8.0, 0.6 + 0.45 * max(1, len(effects)))
     axis = figure.subplots()
     names = [effect.name for effect in effects]
-    gains = [effect.before_nm - effect.after_nm for effect in effects]
+    gains = [effect.left_out_nm or 0.0 for effect in effects]
     axis.barh(names, gains, color=[PLANTED if name in planted else OTHER for name in names])
     axis.invert_yaxis()
-    axis.set_xlabel("error less, nm")
+    axis.set_xlabel("error without it, nm more")
     return figure
 
 

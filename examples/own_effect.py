@@ -4,7 +4,7 @@
 
 Registers a process effect (the first layers sink into the adhesion promoter) and a term of single scans
 (a scanner whose bow has a cubic part), then closes the loop as `litho-models close-loop` does. Nothing else
-has to change: both are candidates, with a verdict and its reason in `close_loop.json` and `report.html`.
+has to change: `close_loop.json` and `report.html` have a verdict on both.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.commands import run_script
-from litho_models import LoopConfig, close_loop, register_effect, register_scan_term
+from litho_models import close_loop, register_effect, register_scan_term
 from litho_models.effects import Effect, FieldContext, Parameter
 from litho_models.effects.effect import Values
 from litho_models.scan_terms import FloatMap, ScanTerm, TermPixels
@@ -80,13 +80,17 @@ def main() -> None:
     )
     parser.add_argument("store", help="dataset store")
     parser.add_argument("--out", required=True, help="folder of the result")
+    parser.add_argument("--base", default="physics", help="model to correct (default physics)")
     parser.add_argument("--folds", type=int, default=5, help="outer folds, by scan (default 5)")
     given = parser.parse_args()
     register()
-    result = close_loop(given.store, given.out, config=LoopConfig.model_validate({"folds": given.folds}))
-    for candidate in result.candidates:
-        if candidate.name in ("sinking-layers", "cubic-bow"):
-            print(f"{candidate.name}: {candidate.verdict}, {candidate.reason}")
+    result = close_loop(given.store, given.out, base=given.base, folds=given.folds)
+    for one in (*result.effects, *result.candidates):
+        if one.name == "sinking-layers":
+            print(f"{one.name}: {one.verdict}")
+    for finding in result.single_scans:
+        if finding.name == "cubic-bow":
+            print(f"{finding.name}: {'seen' if finding.seen else 'not seen'}, {finding.evidence}")
 
 
 if __name__ == "__main__":

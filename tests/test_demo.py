@@ -18,13 +18,12 @@ RESULTS = ROOT / "docs" / "results" / "neural-lithography"
 
 
 def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
-    knobs = ["tilt-bow=15", "write-order-memory=0.15"]
+    knobs = ["elliptical-psf=0.3", "write-order-memory=0.15"]
     litho_data.simulate(tmp_path / "fab", count=1, size_px=64, knobs=knobs)
     write_store(tmp_path / "store.zarr", make_scans(2, 32))
-    for name in ("close_loop", "benchmark"):
-        folder = tmp_path / name.replace("_", "-")
-        folder.mkdir()
-        shutil.copy(RESULTS / f"{name}.json", folder)
+    for name, result in (("close-loop", "causes/close_loop.json"), ("benchmark", "benchmark.json")):
+        (tmp_path / name).mkdir()
+        shutil.copy(RESULTS / result, tmp_path / name)
     model = litho_models.save_frozen(litho_models.build_model("identity"), tmp_path / "printer")
     small = {"layout.size_px": 32, "optics.distance_um": 10, "search.iterations": 1}
     settings = litho_design.hologram_settings(
@@ -43,7 +42,7 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     text = page.write(tmp_path, "index.html").read_text("utf-8")
     assert re.findall(r"<h2[^>]*>\s*(\d)\. ", text) == list("123456")
     assert text.count("<figure") == 6
-    # tilt-bow is among the effects found on the measured prints, whose result stands in here.
+    # elliptical-psf is among the effects found on the measured prints, whose result stands in here.
     assert "2 effects were hidden in the prints, and the loop found 1 of them" in text
     assert "Planted and not found: write-order-memory" in text
     for link in re.findall(r'href="(compare/[^"]+)"', text):

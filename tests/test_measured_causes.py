@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from benchmarks.measured_causes import FOLDER, PAGE, texts
 from benchmarks.record import published
-from litho_models.loop.result.record import CloseLoop as EarlierLoop
+from litho_models.evaluation.results import Benchmark
 from litho_models.twin.record import CloseLoop
 
 
@@ -15,7 +15,7 @@ def test_the_page_quotes_the_committed_record():
 
 def test_the_record_is_of_the_measured_prints_and_its_rows_are_made_alike():
     result = CloseLoop.read(FOLDER)
-    assert result.dataset.sha256 == EarlierLoop.read(FOLDER.parent).dataset.sha256
+    assert result.dataset.sha256 == Benchmark.read(FOLDER.parent).dataset.sha256
     scans = {frozenset(row.by_scan_nm) for row in result.errors if row.held_out != "locked"}
     (development,) = scans
     assert not development & set(result.split.lock_box)

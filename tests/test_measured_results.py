@@ -9,10 +9,8 @@ from statistics import median
 import pytest
 
 from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
-from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
 from litho_models.evaluation.results import Benchmark
-from litho_models.loop.result.record import CloseLoop
 from litho_models.noise.result import NoiseAnalysis
 
 
@@ -22,16 +20,12 @@ def test_the_page_quotes_the_committed_results(page):
 
 
 def test_the_committed_results_are_of_the_published_schemas():
-    loop = CloseLoop.read(FOLDER)
     benchmark = Benchmark.read(FOLDER)
     noise = NoiseAnalysis.read(FOLDER)
-    assert loop.dataset.sha256 == benchmark.dataset.sha256 == noise.dataset.sha256
-    # The locked scans were opened for a table of their own; the others' figures are without them.
-    assert loop.locked_before is not None
-    assert loop.locked_after is not None
+    assert benchmark.dataset.sha256 == noise.dataset.sha256
     assert not benchmark.locked_scores
     assert not benchmark.split.lock_box_opened
-    assert not set(loop.split.lock_box) & set(benchmark.split.scored_ids)
+    assert not set(benchmark.split.lock_box) & set(benchmark.split.scored_ids)
     assert noise.run.n_scans == len(benchmark.split.scored_ids)
 
 
@@ -45,28 +39,6 @@ def test_the_pages_say_where_the_locked_scans_take_part():
     page = (FOLDER / "README.md").read_text("utf-8")
     assert "These draws include the locked scans" in page
     assert "4 locked scans are in no fold and in no figure of this table" in texts(FOLDER)["benchmark"]
-
-
-def test_only_what_the_loop_on_physics_confirms_is_said_to_be_found_there():
-    network = CloseLoop.read(FOLDER / "close_loop_pbl.json").model_dump(mode="json")
-    physics = CloseLoop.read(FOLDER).model_dump(mode="json")
-    screened = network["candidates"][0]
-    network["candidates"] = [
-        {**screened, "name": name, "verdict": "absorbed"} for name in ("a", "b", "c", "d")
-    ]
-    found = physics["effects"][0]
-    physics["effects"] = [
-        {**found, "name": "a", "verdict": "confusable", "confusable_with": ["b"]},
-        {**found, "name": "c", "verdict": "traced-to-covariate", "confusable_with": []},
-    ]
-    physics["candidates"] = [
-        {**screened, "name": "c", "verdict": "traced-to-covariate", "reason": "near the cause"},
-        {**screened, "name": "d", "verdict": "below-noise", "reason": "a table does the same"},
-    ]
-    said = loop_table(network, physics)
-    assert "Found on Physics and already carried by the network: a, b.\n" in said
-    assert "c. The loop on Physics itself calls it traced-to-covariate: near the cause." in said
-    assert "d. The loop on Physics itself calls it below-noise: a table does the same." in said
 
 
 def test_every_result_is_there():

@@ -98,27 +98,6 @@ def one_sided_flip_p(values: np.ndarray) -> float:
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
 
-def sign_flip_statistics(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cluster-robust z of each column of (scans, columns), and the null distribution of max |z|.
-
-    z = sum s / sqrt(F/(F-1) sum (s - mean)²). The null flips scans, the same flip for all columns:
-    see ``sign_flips``.
-    """
-    count = len(scores)
-    signs = sign_flips(count)
-    sums = signs @ scores
-    squares = (scores**2).sum(axis=0)
-    # A column of equal scores would divide by zero; z is capped where the spread vanishes.
-    spread = np.maximum(squares - sums**2 / count, 1e-6 * squares + np.finfo(float).tiny)
-    z = sums / np.sqrt(count / max(count - 1, 1) * spread)
-    return z[0], np.abs(z).max(axis=1)
-
-
-def family_wise_p(z: float, null_max: np.ndarray) -> float:
-    """Share of sign flips whose largest |z| reaches this one."""
-    return float(np.mean(null_max >= abs(z) * (1 - 1e-9)))
-
-
 def smallest_flip_p(count: int) -> float:
     """Smallest two-sided sign-flip p that so many scans or prints can have: all signs, or their mirror image.
 

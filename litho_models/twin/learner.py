@@ -165,10 +165,13 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     products = Products(grams, {ALL: ("",) * len(grams)})
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
-        inner, inner_fold = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
-        if len(set(inner_fold)) == 1:
-            inner_fold = np.arange(len(rest))
-        block = min(blocks, key=lambda one: float(inner.held_out([one], inner_fold).sum()))
+        inner, inner_of = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
+        if len(set(inner_of)) == 1:
+            inner_of = rest
+        # A single scan has nothing to choose on: the most cautious.
+        block = blocks[-1]
+        if len(rest) > 1:
+            block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
         left[own] = products.squares([block], products.strengths([block], rest), own)
     return left
 

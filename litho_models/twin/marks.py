@@ -95,7 +95,7 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
-    """Outliers that are long along the rows, and along the columns."""
+    """Outliers that are long along the scan lines, and across them."""
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
     numbered, _ = label(scan.usable & (np.abs(residual_um) > _FAR_SD * spread))
@@ -106,7 +106,7 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
         if sizes[number] >= _FEWEST_PX:
             along += width >= _DRAWN_OUT * height
             across += height >= _DRAWN_OUT * width
-    return along, across
+    return (across, along) if axis_along(scan.line) == 0 else (along, across)
 
 
 def _short_lines(

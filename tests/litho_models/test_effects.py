@@ -397,3 +397,30 @@ def test_stripes_follow_the_scan_lines_with_the_stated_spread() -> None:
     assert float(striped.std(dim=-1).max()) == 0.0
     # Relative error of a standard deviation from n draws: 1 / sqrt(2 n) = 1.6 %; four of them.
     assert float(striped[..., 0].std()) == pytest.approx(0.008, rel=0.065)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_slices_set_alike_in_wide_areas_and_differ_where_narrower_than_the_spot(share: float) -> None:
+    layout = torch.zeros(1, 1, 60, 60)
+    layout[..., 30:] = 0.5
+    layout[..., 20:40, 12] = 0.5
+    context = FieldContext(layout, 0.1, 1.2)
+    effect = get_effect("layer-stacking")
+    changed = effect(layout, effect.with_values({"share": share}), context) - layout
+    # Wide areas: 0 and 1 are fixed points of the step. A line of one pixel is below the threshold: lost.
+    assert float(changed[..., 50].abs().max()) < 1e-4
+    line = float(changed[..., 30, 12])
+    assert line < -0.05 if share else line == 0.0
+
+
+def test_the_interface_cuts_the_print_from_below() -> None:
+    height = torch.linspace(0, 1.2, 13).reshape(1, 1, 1, 13)
+    values = {"depth_um": 0.25, "substrate_um": 0.05, "shrinkage": 0.0}
+    cut = get_effect("interface-offset")(height, values, FieldContext(height, 0.1, 1.2))
+    # What is not above the substrate stays; what is loses the depth and ends at the substrate.
+    assert float(cut[..., 0]) == 0
+    assert torch.allclose(cut[..., 1:], torch.clamp(height[..., 1:] - 0.25, min=0.05), atol=1e-6)
+    # Around a place half as dense as the densest, the lost part had shrunk by half of `shrinkage`.
+    half = FieldContext(torch.full_like(height, 0.6), 0.1, 1.2)
+    shrunk = get_effect("interface-offset")(height, {**values, "shrinkage": 0.4}, half)
+    assert torch.allclose(shrunk[..., 1:], torch.clamp(height[..., 1:] - 0.2, min=0.05), atol=1e-6)

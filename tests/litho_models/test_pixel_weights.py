@@ -1,4 +1,4 @@
-"""Pixels count by their uncertainty where asked, in every kind of fit, and alike everywhere else."""
+"""Pixels count by their uncertainty where asked, in every kind of training."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ import pytest
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
-from litho_models.effects.chain import EffectChain
 from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.fitting.pixel_weights import pixel_weights
-from litho_models.loop.fold_fits import fit_folds, predict
-from litho_models.twin.prepared import prepare_scans
 from litho_models.models import build_model
 from tests.litho_models.prints import make_scans
 
@@ -53,25 +50,6 @@ def test_a_fit_believes_pixels_by_their_uncertainty(scans, name):
     alone = _vector(name, _half(scans))
     # Weights are 1 / 50 for the spoilt half: what remains of its pull is that share, with room for the noise.
     assert np.abs(weighted - alone).max() < 0.1 * np.abs(uniform - alone).max()
-
-
-# Absolute values bound the pull of the spoilt half by themselves, so there is less to win.
-@pytest.mark.parametrize(("loss", "share"), [("squares", 0.1), ("absolute", 0.5)])
-def test_the_loop_fits_by_them_and_judges_without(scans, loss, share):
-    model = build_model("affine", **common_geometry(scans))
-    chain = EffectChain(model, [], full_height_um=1.2, pitch_um=0.1)
-    fold_of = np.array([0, 1, 0, 1])
-    uniform, weighted = (
-        fit_folds(chain, prepare_scans(scans), fold_of, loss, weights) for weights in ("uniform", "sigma")
-    )
-    alone = fit_folds(chain, prepare_scans(_half(scans)), fold_of, loss)
-    for found in ("common", "per_fold"):
-        pulled = np.abs(getattr(uniform, found) - getattr(alone, found)).max()
-        assert np.abs(getattr(weighted, found) - getattr(alone, found)).max() < share * pulled
-    # What screening sees of a scan counts all pixels alike: its residuals are heights in µm.
-    window = prepare_scans(scans)[0]
-    predicted = window.at_sample(predict(weighted.chain, weighted.common, window))
-    np.testing.assert_allclose(weighted.linear[0].residual, window.height - predicted, atol=1e-6)
 
 
 def test_weights_have_mean_one_and_are_zero_where_nothing_is_measured(scans):

@@ -8,6 +8,7 @@ from scipy.ndimage import distance_transform_cdt, gaussian_filter
 
 from litho_data.foundation.errors import InputError
 from litho_data.register import Bend, resample_to_layout
+from litho_models.effects import get_effect
 from litho_models.scan_terms import (
     POLICIES,
     SCAN_TERMS,
@@ -72,6 +73,13 @@ def test_the_catalogue_is_complete_and_consistent():
         # What a scan adds leaves its datum alone, unless it is the datum; displacements follow the slopes.
         if term.maps is not None and term.unit != "px" and term.name != "offset":
             assert np.abs(term.maps(pixels).mean(axis=1)).max() < 1e-12
+
+
+def test_a_scan_term_and_its_effect_say_the_same():
+    for term in SCAN_TERMS.values():
+        if term.effect is not None:
+            assert get_effect(term.effect).role == term.role
+            assert term.lines is not None or get_effect(term.effect).per_scan
 
 
 def test_policies_are_named_sets_of_terms():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.adequacy import reshaped_gain
-from litho_models.twin.closing import FORM_SHARE
-from litho_models.twin.fits import fit_state
+from litho_models.twin.closing import FORM_SHARE, Checked, _larger
+from litho_models.twin.fits import Study, fit_state
+from litho_models.twin.judging import judge
+from litho_models.twin.search import Cause, Found
 from tests.litho_models.twin_scans import bare_state, planted, study_of
 
 
@@ -40,3 +43,52 @@ def test_a_mimic_is_refused() -> None:
 
 def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
     assert share("slope-thinning", "slope-thinning", beside=("write-order-memory",)) < FORM_SHARE
+
+
+@pytest.mark.parametrize(
+    ("reshaped_nm2", "left_nm2", "corrects", "said"),
+    [
+        (1.4, 0.0, "", ""),  # 14 % of its gain in other shapes
+        (1.6, 5.0, "", "takes 16 % of its gain"),
+        (1.6, 5.4, "", ""),  # more than twice as much again is left for causes that are missing
+        (0.0, 0.0, "galvo-lag", "may only correct the formula of galvo-lag"),
+    ],
+)
+def test_the_limits_of_a_name_are_those_that_are_written(
+    reshaped_nm2: float, left_nm2: float, corrects: str, said: str
+) -> None:
+    judgement = judge(np.full(10, 100.0), np.full(10, 90.0), Study((), np.empty(0)))
+    cause = Cause("slope-thinning", ALL, (), judgement, 0.01, None)
+    one = Checked(cause, reshaped_nm2, left_nm2, corrects)
+    assert one.gain_nm2 == pytest.approx(10)
+    assert said in one.reason
+    assert one.holds is (said == "")
+
+
+@pytest.mark.parametrize(
+    ("small", "values", "corrected"),
+    [
+        ("slope-x-power-3", {"strength": 0.004}, "slope-x-power-1"),
+        ("field-curvature", {"tilt_x_um": 0.02}, ""),
+    ],
+)
+def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
+    small: str, values: dict[str, float], corrected: str
+) -> None:
+    """The cube of a slope is the slope in another shape, a tilt of the field is not."""
+    strengths = {"slope-x-power-1": {"strength": 0.06}, small: get_effect(small).with_values(values)}
+    study = study_of(planted([(name, ALL, {"": own}) for name, own in strengths.items()]))
+    twin = bare_state(study).twin
+    for name, own in strengths.items():
+        twin = twin.with_effect(name, ALL, {"": own})
+    state = fit_state(twin, study)
+    without = {name: fit_state(state.twin.without(name), study) for name in strengths}
+    causes = [
+        Cause(name, ALL, (), judge(one.freed_nm2, state.freed_nm2, study), 0.01, None)
+        for name, one in without.items()
+    ]
+    large, minor = causes
+    assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
+    found = Found(state, causes)
+    assert _larger(minor, found, without, study) == corrected
+    assert _larger(large, found, without, study) == ""

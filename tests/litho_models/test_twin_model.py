@@ -9,11 +9,21 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import get_effect
+from litho_models.models import build_model
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.fits import TwinProblem, fit_state, prepared_among, without_terms
 from litho_models.twin.model import Slot, Twin, Values
-from litho_models.twin.results import clustered_covariance
-from tests.litho_models.twin_scans import BLUR_UM, PITCH_UM, bare_state, base_model, planted, study_of
+from litho_models.twin.prepared import LARGE_PX, prepare_scans
+from litho_models.twin.results import clustered_covariance, confounded
+from tests.litho_models.twin_scans import (
+    BLUR_UM,
+    PITCH_UM,
+    bare_state,
+    base_model,
+    blank_scans,
+    planted,
+    study_of,
+)
 
 THINNING = "slope-thinning"
 
@@ -218,3 +228,52 @@ def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(stud
     assert between.context.order == pytest.approx(
         (study.scans[6].context.order + study.scans[8].context.order) / 2
     )
+
+
+def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
+    scans = prepare_scans(blank_scans(4, LARGE_PX))
+    assert len({scan.window.context.origin_px for scan in scans}) == 4
+    for scan in scans:
+        y, x = (v.numpy() for v in scan.window.context.centred_um())
+        row, column = scan.window.context.origin_px
+        full_y, full_x = (v.numpy() for v in scan.context.centred_um())
+        # Centres are computed in float32 µm: 2e-6 relative.
+        assert np.allclose(y[:, 0], full_y[row : row + len(y), 0], atol=1e-4)
+        assert np.allclose(x[0], full_x[0, column : column + x.shape[1]], atol=1e-4)
+
+
+def test_two_blurs_are_known_together_only(study) -> None:
+    """What the resist and the microscope blur one after the other: their sum is known, not the parts."""
+    blurs = [(name, {"variance_um2": 0.02}) for name in ("diffusion-blur", "resampling-blur")]
+    alike = study_of(planted([(name, ALL, {"": values}) for name, values in blurs]))
+    twin = Twin.bare(base_model(), alike.scans[0])
+    for name, values in blurs:
+        twin = twin.with_effect(name, ALL, {"": values})
+    pairs = {frozenset(pair): value for *pair, value in confounded(fit_state(twin, alike))}
+    assert set(pairs) == {frozenset(f"{name} variance_um2" for name, _ in blurs)}
+    assert -1 <= min(pairs.values()) < -0.95
+    # A blur and a loss on slopes are told apart, and so are gain and offset of the base.
+    (name, values), _ = blurs
+    apart = Twin.bare(base_model(), study.scans[0]).with_effect(name, ALL, {"": values})
+    assert confounded(fit_state(apart.with_effect(THINNING, ALL, {"": thinning(0.15)}), study)) == []
+
+
+def test_without_fitted_numbers_nothing_is_confounded(study) -> None:
+    frozen = Twin.bare(base_model().requires_grad_(False), study.scans[0])
+    assert confounded(fit_state(frozen, study)) == []
+
+
+@pytest.mark.parametrize("depth_um", [0.1, 0.25])
+def test_what_the_base_took_of_an_effect_does_not_keep_a_fit_from_it(depth_um: float) -> None:
+    """From one of the two starts the fit ends at 24 nm with the fresh base, at 8 nm with the fitted one."""
+    effect = get_effect("interface-offset")
+    deep = effect.with_values({"depth_um": 0.6, "shrinkage": 0.4, "substrate_um": 0.05})
+    made = build_model(
+        "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
+    )
+    study = study_of(planted([(effect.name, ALL, {"": deep})], count=4, seed=3, base=made), folds=2)
+    fitted = fit_state(Twin.bare(build_model("physics"), study.scans[0]), study)
+    shallow = effect.with_values({"depth_um": depth_um})
+    state = fit_state(fitted.twin.with_effect(effect.name, ALL, {"": shallow}), study)
+    # White noise of 4 nm is left.
+    assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.08)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,23 +16,31 @@ import tifffile
 
 import litho_data
 from litho_data.foundation.errors import InputError
-from litho_data.store import open_store
+from litho_data.store import PrintedScan, open_store
+from litho_data.store.lock_box import lock_box, locked_ids
 from litho_models.effects import get_effect
+from litho_models.fitting.runs import train
+from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
+from litho_models.frozen.freezing import freeze
+from litho_models.scan_terms import measurement
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin import bases, closing
-from litho_models.twin.closing import freed_scans
-from litho_models.twin.errors import REPORTED, error_rows
+from litho_models.twin import bases, closing, run
+from litho_models.twin.closing import Closed, close, freed_scans
+from litho_models.twin.errors import REPORTED, HeldOut, error_rows
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop, Explained
 from litho_models.twin.report import effect_text, measurement_text, verdict_text
 from litho_models.twin.results import _verdict, clustered_covariance
 from litho_models.twin.run import close_loop, dealt
+from litho_models.twin.saving import save_model
 from tests.litho_models.prints import make_scans, write_store
-from tests.litho_models.twin_scans import bare_state, blank_scan, planted, study_of, with_heights
+from tests.litho_models.twin_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 
 COUNT = 12
 BASE = "affine-mtf"
-CAUSES = ("write-order-memory", "slope-thinning", "galvo-lag")
+CAUSES = ("write-order-memory", "slope-thinning", "galvo-lag", "vertical-shrinkage")
 SOME_LAWS, TABLE = ("height-power-2", "slope-x-power-1"), "level-table"
 TABLES = {"errors.csv": "errors", "candidates.csv": "candidates", "explained.csv": "explained"}
 
@@ -105,6 +115,8 @@ def test_every_candidate_has_a_verdict_once(closed) -> None:
     names = [one.name for one in (*result.effects, *result.candidates)]
     assert len(names) == len(set(names))
     assert all(one.reason for one in result.candidates)
+    # A gain is a number of the base.
+    assert next(one.verdict for one in result.candidates if one.name == "vertical-shrinkage") == "absorbed"
 
 
 def test_every_column_of_a_table_is_the_field_that_it_names(closed) -> None:
@@ -164,6 +176,33 @@ def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) 
     own = result.error("all", held_out="locked")
     assert own is not None
     assert np.abs(left - np.median(left)).mean() < 3 * own.by_scan_nm[scan.id]
+
+
+def test_only_what_is_the_printers_is_exported(closed, store: Path, tmp_path: Path) -> None:
+    result, _, _ = closed
+    for one in result.effects:
+        roles = {get_effect(name).role for name in (one.name, *one.confusable_with)}
+        assert one.role == (roles.pop() if len(roles) == 1 else "undetermined")
+    opened = open_store(store)
+    scans = prepare_scans(opened.scans())
+    roles_of = {"galvo-lag": "process", "slope-thinning": "undetermined", "tip-dilation": "measurement"}
+    twin = Twin.bare(base_model(), scans[0])
+    for name in roles_of:
+        twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values({})})
+    found = SimpleNamespace(
+        final=SimpleNamespace(twin=twin), study=SimpleNamespace(scans=scans), original=scans
+    )
+    effects = [SimpleNamespace(name=n, role=role, confusable_with=[]) for n, role in roles_of.items()]
+    save_model(found, result.model_copy(update={"effects": effects}), opened, tmp_path / "model")  # type: ignore[arg-type]
+    card = ModelCard.read(tmp_path / "model")
+    exported = (card.process_effects, card.undetermined_effects, card.measurement_effects)
+    assert [[*own] for own in exported] == [[name] for name in roles_of]
+
+
+def test_a_folder_of_the_loop_is_frozen_as_its_model(closed, tmp_path: Path) -> None:
+    _, out, _ = closed
+    card = freeze(out, tmp_path / "frozen")
+    assert card.weights_sha256 == ModelCard.read(out / "model").weights_sha256
 
 
 def test_texts_follow_the_verdict(closed) -> None:
@@ -284,17 +323,83 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cause, no law, no table, and little that scans may share."""
+    for name in ("LAWS", "DESCRIPTIONS"):
+        monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
+    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))
+
+
+def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(quick: None, tmp_path: Path) -> None:
     store = write_store(tmp_path / "few.zarr", make_scans(3, 64))
     result = close_loop(store, tmp_path / "out", base="affine")
     assert result.verdict == "too-few-scans"
     assert {row.held_out for row in result.errors} == {"scans"}
     assert result.groups.get(ALL) is None
+
+
+def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropped(
+    quick: None, tmp_path: Path
+) -> None:
+    scans = make_scans(6, 64)
+    locked = locked_ids(scans)
+    # Drawn with this seed, or from the scans that are left, the box would be another.
+    assert lock_box([s.id for s in scans], [s.print_id for s in scans], 1, seed=2) != locked
+    # Next to nothing of the locked scan was measured, so that it is dropped.
+    corner = np.zeros(scans[0].shape, bool)
+    corner[:4, :4] = True
+    empty = [replace(s, valid=corner) if s.id in locked else s for s in scans]
+    for number, given in enumerate((scans, empty)):
+        path, out = write_store(tmp_path / f"{number}.zarr", given), tmp_path / f"loop{number}"
+        found = close_loop(path, out, base="affine", seed=2, folds=2)
+        assert found.split.lock_box == locked
+        assert train(path, "identity", tmp_path / f"run{number}").lock_box == locked
+        assert len(found.run.dropped) == number
+        assert found.run.n_scans == len(scans) - len(locked)
+        # Design flags layouts outside what the model was fitted on by the shares of the levels there.
+        used = np.concatenate([s.mask_level.ravel() for s in scans if s.id not in locked])
+        shares = ModelCard.read(out / "model").training_level_share
+        assert shares == pytest.approx(np.bincount(used, minlength=len(shares)) / used.size, abs=1e-12)
+
+
+def test_scans_of_different_sizes_are_taken_together(quick: None) -> None:
+    single = [planted(count=1, size_px=size)[0] for size in (48, 56, 64, 48)]
+    scans = [replace(scan, id=f"S{number}", order=number) for number, scan in enumerate(single)]
+    study = replace(study_of(scans, 2), scans=())
+    found = close(scans, study.fold_of, base_model(), study)
+    rows = HeldOut(found, study).errors()
+    assert {tuple(row.by_scan_nm) for row in rows} == {tuple(scan.id for scan in scans)}
+    assert np.isfinite([row.mae_nm for row in rows]).all()
+
+
+@pytest.mark.slow
+def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
+    quick: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law, seen = "slope-x-power-1", []
+    monkeypatch.setattr(closing, "LAWS", {law: get_effect(law)})
+
+    def watched(scans: Sequence[PrintedScan], *given: Any, **named: Any) -> Closed:
+        seen.append({scan.print_id for scan in scans})
+        return close(scans, *given, **named)
+
+    monkeypatch.setattr(run, "close", watched)
+    made = planted([(law, ALL, {"": {"strength": 0.05}})], count=12)
+    scans = [replace(scan, print_id=str(number // 4)) for number, scan in enumerate(made)]
+    rows, often = run._nested(scans, base_model(), replace(study_of(scans), scans=()), "prints")
+    assert seen == [{"1", "2"}, {"0", "2"}, {"0", "1"}]
+    # The law is chosen in every selection, and its gain lasts.
+    assert often == {law: 3}
+    before, after = (
+        next(row for row in rows if (row.model, row.policy) == (model, "offset")) for model in ("base", "all")
+    )
+    assert {row.held_out for row in rows} == {"nested prints"}
+    assert [*after.by_scan_nm] == [scan.id for scan in scans]
+    # White noise of 4 nm: E|n| = 0.8 sd.
+    assert after.mae_nm == pytest.approx(4 * np.sqrt(2 / np.pi), rel=0.1)
+    assert after.mae_nm < 0.8 * before.mae_nm
 
 
 def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -> None:

@@ -88,6 +88,20 @@ def test_what_the_base_does_is_no_candidate(in_all) -> None:
     assert found.retained < 1e-5
 
 
+def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
+    """What slopes of both axes lack a blunt tip would have added."""
+    name = "slope-thinning"
+    thinned = get_effect(name).with_values({"along_x_um": 0.1, "along_y_um": 0.1})
+    study = study_of(planted([(name, ALL, {"": thinned})]))
+    effects = [get_effect("tip-dilation"), get_effect(name)]
+    found = {
+        one.name: one for one in Screening(bare_state(study), study, effects).candidates if one.by == ALL
+    }
+    assert not found["tip-dilation"].allowed
+    assert found[name].allowed
+    assert found[name].gain_nm2 > found["tip-dilation"].gain_nm2
+
+
 def _effect():
     return of_development(
         name="made",

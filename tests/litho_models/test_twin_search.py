@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from litho_models.effects import CATALOGUE, get_effect
+from litho_models.models import build_model
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.fits import Study, fit_state
 from litho_models.twin.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
-from litho_models.twin.model import Values
+from litho_models.twin.model import Twin, Values
 from litho_models.twin.search import Found, same_change, search, separating, untestable
 from tests.litho_models.twin_scans import bare_state, planted, study_of
 
@@ -85,6 +86,37 @@ def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
     assert found.refused[THINNING].startswith(f"{FEWEST_SCANS - 2} scans, at least {FEWEST_SCANS}")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "values", "beside"),
+    [
+        # Along one diagonal 0.3 µm wider in quadrature: more than half of it is plain blur.
+        ("elliptical-psf", {"shear_um2": 0.09}, ["diffusion-blur", "galvo-lag"]),
+        # Lost at the foot, which every print is lower by: not shrunk.
+        ("interface-offset", {"depth_um": 0.25}, ["vertical-shrinkage", "height-saturation"]),
+        # Offsets of rows, which every scan may have of its own, could hide them.
+        (
+            "hatch-ripple",
+            {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31},
+            ["slope-thinning"],
+        ),
+        # Bare places are not tilted with the print: that tells it from a tilt of the microscope.
+        ("field-curvature", {"tilt_x_um": 0.06, "tilt_y_um": -0.04}, ["vignetting"]),
+    ],
+)
+def test_a_cause_that_another_resembles_is_found(
+    name: str, values: dict[str, float], beside: list[str]
+) -> None:
+    """On a Physics model, whose own blur, gain and saturation are fitted beside it."""
+    base = build_model("physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4)
+    effect = get_effect(name)
+    study = study_of(planted([(name, ALL, {"": effect.with_values(values)})], base=base, size_px=64))
+    start = fit_state(Twin.bare(build_model("physics"), study.scans[0]), study)
+    found = search(start, study, [effect, *map(get_effect, beside)])
+    assert found.names == [name]
+    assert found.causes[0].alike == ()
+
+
 def test_no_more_effects_than_asked_for() -> None:
     study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)})]))
     assert search(bare_state(study), study, CANDIDATES, most=0).names == []
@@ -153,6 +185,13 @@ def test_what_scans_cannot_test_is_said_before_any_fit() -> None:
     assert set(untestable(study_of(unordered))) == needing
     assert needing
     assert untestable(study_of(scans)) == {}
+
+
+def test_the_radius_of_the_tip_is_that_of_the_first_scan_that_knows_it() -> None:
+    scans = planted(count=3)
+    assert study_of(scans).tip_radius_um is None
+    known = [scans[0], *(replace(scan, tip_radius_um=0.13) for scan in scans[1:])]
+    assert study_of(known).tip_radius_um == 0.13
 
 
 def test_the_experiment_that_parts_a_set_is_named_once() -> None:

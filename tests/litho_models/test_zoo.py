@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -115,8 +116,9 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     from litho_data.store import open_store
     from litho_models.evaluation.results import Evaluation
     from litho_models.frozen.freezing import freeze
-    from litho_models.loop.run import _base_model
     from litho_models.noise.residuals import read_residuals
+    from litho_models.twin.bases import choose_base
+    from litho_models.twin.fits import Study
 
     name = zoo.list()[-1]
     named, there = f"zoo:{name}", zoo.folder(name)
@@ -125,7 +127,8 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
     assert Evaluation.read(tmp_path / "out").model.name == name
     assert freeze(named, tmp_path / "frozen").weights_sha256 == ModelCard.read(there).weights_sha256
-    assert _base_model(named, open_store(store))[1] == name
+    nobody = Study((), np.zeros(0, int))
+    assert choose_base(named, open_store(store).scans(), nobody, steps=None, cache=tmp_path).name == name
     assert read_residuals(open_store(store), [named]).model == name
     for wrong, said in (("zoo:resnet", name), (name, f"did you mean {named}")):
         with pytest.raises(InputError, match=said):

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.store import PrintedScan
-from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.models import build_model
 from litho_models.simulator import Simulator
 from litho_models.twin.fits import State, Study, fit_state
 from litho_models.twin.model import Twin, Values
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 
 PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 0.1, 13, 0.1
 FIELDS, BLUR_UM = 2, 0.25
@@ -68,12 +68,13 @@ def planted(
     size_px: int = 48,
     noise_um: float = 0.004,
     seed: int = 0,
+    base: Simulator | None = None,
 ) -> list[PrintedScan]:
-    """Scans of the base with effects (name, grouping, values by label), a datum each, and white noise."""
+    """Scans of a base with effects (name, grouping, values by label), a datum each, and white noise."""
     rng = np.random.default_rng(seed)
     scans = blank_scans(count, size_px)
     prepared = prepare_scans(scans)
-    twin = Twin.bare(base_model(), prepared[0])
+    twin = Twin.bare(base or base_model(), prepared[0])
     for name, by, values in effects:
         twin = twin.with_effect(name, by, values)
     placed = twin.placed()

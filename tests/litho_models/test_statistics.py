@@ -1,4 +1,4 @@
-"""Variance components: the F of a textbook, its p by permutation, and planted roles."""
+"""Statistics of scans and prints: exact flips of signs, the F of a textbook and its p by permutation."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from scipy.stats import f_oneway
 
-from litho_models.effects import get_effect
-from litho_models.loop.single_scans.nested_tests import MeasurementTest
-from litho_models.scoring.statistics import ByPrint, by_print
+from litho_models.scoring.statistics import by_print, one_sided_flip_p, sign_flips
 
 PRINTS = ["1"] * 4 + ["2"] * 3 + ["3"] * 4 + ["4"] * 3
+
+
+def test_sign_flips_are_exhaustive_for_few_scans_and_hold_the_observed_signs() -> None:
+    signs = sign_flips(5)
+    assert len({tuple(row) for row in signs}) == 32
+    assert (signs[0] == 1).all()
+    assert (sign_flips(20)[0] == 1).all()
+    assert one_sided_flip_p(np.ones(8)) == 1 / 256
 
 
 def test_f_is_that_of_a_one_way_analysis_and_p_close_to_its_own():
@@ -40,12 +46,3 @@ def test_columns_count_alike_whatever_their_unit_and_nothing_to_tell_is_none():
     assert by_print(two, ["1"] * 14) is None
     assert by_print(two, range(14)) is None
     assert by_print(np.ones(14), PRINTS) is None
-
-
-def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes():
-    def role(name: str, p: float) -> str:
-        grouped = ByPrint(f=5.6, degrees=(5, 14), icc=0.58, p=p)
-        return MeasurementTest(get_effect(name), None, None, None, 0.0, {}, "", by_print=grouped).role
-
-    assert (role("z-gain", 0.003), role("z-gain", 0.3)) == ("undetermined", "measurement")
-    assert role("line-roughness", 0.003) == get_effect("line-roughness").role == "nuisance"

@@ -8,32 +8,34 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.ridge import feature_rows
-from litho_models.loop import explainable
-from litho_models.twin.learner import Learner, Rest
-from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.loop.study import Study
 from litho_models.models import build_model
-from tests.litho_models.loop_scans import printed_scans, true_model
+from litho_models.twin import learner as module
+from litho_models.twin.fits import Study
+from litho_models.twin.learner import Learner, Rest
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan
+from tests.litho_models.twin_scans import base_model, planted, study_of
 
-FOLD_OF = np.arange(10) % 5
+NOISE_UM = 0.006
 Change = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[list[PreparedScan], list[np.ndarray]]:
-    scans = prepare_scans(printed_scans(count=10, size_px=96, seed=5))
-    with torch.no_grad():
-        return scans, [true_model({})(f.layout, f.context)[0, 0].numpy() for f in scans]
+def scene() -> tuple[Study, list[np.ndarray], Learner]:
+    """Scans, what they show but for their noise, and the learner of them."""
+    study = study_of(planted(size_px=96, noise_um=NOISE_UM))
+    placed = Twin.bare(base_model(), study.scans[0]).placed()
+    predictions = [placed.height(scan) for scan in study.scans]
+    return study, predictions, Learner(study, predictions)
 
 
-def changed(scans: list[PreparedScan], predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
+def changed(study: Study, predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
     """Predictions that lack a change."""
-    return [p - change(f, p).astype(np.float32) for f, p in zip(scans, predictions, strict=True)]
+    return [p - change(f, p).astype(np.float32) for f, p in zip(study.scans, predictions, strict=True)]
 
 
 def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
@@ -60,8 +62,8 @@ def displaced(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
 
 
 def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
-    scans, predictions = scene
-    rest = Learner(Study(scans, FOLD_OF), predictions).rest(predictions)
+    _, predictions, learner = scene
+    rest = learner.rest(predictions)
     assert not rest.matters
     assert rest.share < 0.01
     # Offset, gain, five of tilt and bow, six of an affine error of the registration.
@@ -70,68 +72,73 @@ def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
 
 @pytest.mark.parametrize("change", [bead, later, placed, displaced])
 def test_what_follows_layout_order_or_place_is_measured_in_its_size(scene, change) -> None:
-    scans, predictions = scene
-    learner = Learner(Study(scans, FOLD_OF), predictions)
-    lacking = changed(scans, predictions, change)
+    study, predictions, learner = scene
+    lacking = changed(study, predictions, change)
     rest, true = learner.rest(lacking), learner.rest(predictions)
     there = float((rest.squares_nm2 - true.squares_nm2).mean())
     assert rest.matters
     assert rest.ci95_nm2[0] <= rest.mean_nm2 <= rest.ci95_nm2[1]
-    # A fifth is left for the spread of 200 coefficients over 80,000 correlated pixels and for the ridge.
+    # A fifth is left for the spread of 200 coefficients over 64,000 pixels and for the ridge.
     assert 0.8 * there < rest.mean_nm2 < 1.05 * there
 
 
 def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene) -> None:
-    scans, predictions = scene
-    learner = Learner(Study(scans, FOLD_OF), predictions)
+    study, predictions, learner = scene
     # One scan alone has a pattern of its own: the others cannot know it.
     alone = list(predictions)
-    alone[0] = alone[0] - bead(scans[0], alone[0])
+    alone[0] = alone[0] - bead(study.scans[0], alone[0])
     gains, before = learner.rest(alone).gains_nm2, learner.rest(alone).squares_nm2
     assert gains[0] < 0.05 * (before[0] - learner.rest(predictions).squares_nm2[0])
 
 
+def test_two_folds_are_enough(scene) -> None:
+    """The weight of the ridge is then chosen on single scans of the other fold."""
+    study, predictions, learner = scene
+    halves = Learner(replace(study, fold_of=np.arange(10) % 2), predictions)
+    lacking = changed(study, predictions, bead)
+    assert halves.rest(lacking).mean_nm2 == pytest.approx(learner.rest(lacking).mean_nm2, rel=0.1)
+
+
 def test_what_may_follow_the_order_are_height_slopes_and_surroundings(scene) -> None:
     """The learner takes them by their place in a default model's features."""
-    scan = scene[0][0]
+    scan = scene[0].scans[0]
     rows = feature_rows(build_model("features"), scan.stored, scan.sample)
     layout, pitch = scan.stored.layout_um / 1.2, scan.stored.pitch_um
     height, near = (gaussian_filter(layout, sigma / pitch, mode="nearest") for sigma in (0.3, 1.6))
     slopes = [np.abs(slope) for slope in np.gradient(height, pitch)]
-    for number, expected in zip(explainable._VARYING, (height, *slopes, near), strict=True):
+    for number, expected in zip(module._VARYING, (height, *slopes, near), strict=True):
         # float32, and a Gaussian cut at four standard deviations.
         assert rows[number] == pytest.approx(scan.at_sample(expected), abs=1e-3)
 
 
 def test_rows_are_thinned_where_they_would_not_fit(scene, monkeypatch) -> None:
-    scans, predictions = scene
-    study = Study(scans, FOLD_OF)
-    lacking = changed(scans, predictions, bead)
-    full = Learner(study, predictions).rest(lacking)
-    pixels = sum(len(scan.sample) for scan in scans)
-    monkeypatch.setattr(explainable, "_KEPT_BYTES", 4 * 320 * pixels // 2)
+    study, predictions, learner = scene
+    lacking = changed(study, predictions, bead)
+    full = learner.rest(lacking)
+    pixels = sum(len(scan.sample) for scan in study.scans)
+    monkeypatch.setattr(module, "_KEPT_BYTES", 4 * 320 * pixels // 2)
     thinned = Learner(study, predictions)
     assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 320 * pixels // 2
-    # Half of the pixels; neighbours share most of their roughness, so little is lost.
+    # Half of the pixels tell nearly the same.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(full.mean_nm2, rel=0.15)
 
 
 def test_a_shift_of_the_registration_is_nothing_to_learn(scene) -> None:
-    scans, predictions = scene
-    shifted = changed(scans, predictions, lambda f, p: 0.1 * np.gradient(p, axis=1))
-    assert not Learner(Study(scans, FOLD_OF), predictions).rest(shifted).matters
+    study, predictions, learner = scene
+    assert not learner.rest(changed(study, predictions, lambda f, p: 0.1 * np.gradient(p, axis=1))).matters
 
 
 def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scene) -> None:
-    scans, predictions = scene
+    study, predictions, learner = scene
     tilted = [
         replace(scan, height=scan.height + 0.05 * scan.position[1] + 0.02 * number)
-        for number, scan in enumerate(scans)
+        for number, scan in enumerate(study.scans)
     ]
-    plain, moved = (Learner(Study(f, FOLD_OF), predictions).rest(predictions) for f in (scans, tilted))
+    plain = learner.rest(predictions)
+    moved = Learner(replace(study, scans=tilted), predictions).rest(predictions)
     assert moved.squares_nm2 == pytest.approx(plain.squares_nm2, rel=1e-6)
-    # Roughness of 6 nm is all that is there.
-    assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(0.006 * NM_PER_UM, rel=0.1)
+    # White noise is all that is there.
+    assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(NOISE_UM * NM_PER_UM, rel=0.03)
 
 
 def test_the_form_may_be_wrong_by_the_upper_end_of_what_could_be_learned() -> None:

@@ -1,0 +1,181 @@
+"""A base that is trained without each fold, or taken as it is: nothing leaks, and what it lacks is found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan
+from litho_models.effects import FieldContext, get_effect
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.frozen.card import ModelCard
+from litho_models.models import build_model
+from litho_models.scan_terms import measurement
+from litho_models.scan_terms.groups import ALL
+from litho_models.simulator import Simulator
+from litho_models.twin import closing
+from litho_models.twin.bases import choose_base
+from litho_models.twin.closing import close
+from litho_models.twin.errors import HeldOut
+from litho_models.twin.fits import Study, fit_state
+from litho_models.twin.folded_base import FoldedBase, train_folds
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import prepare_scans
+from litho_models.twin.run import close_loop
+from litho_models.twin.search import search
+from tests.litho_models.prints import make_scans, write_store
+from tests.litho_models.twin_scans import (
+    LEVEL_HEIGHT_UM,
+    LEVELS,
+    PITCH_UM,
+    base_model,
+    planted,
+    study_of,
+    with_heights,
+)
+
+LAW = "slope-x-power-1"
+STRENGTH = {"strength": 0.04}
+
+
+@pytest.fixture(autouse=True)
+def no_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cause and no law is looked for: that takes time and has its own tests."""
+    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
+    monkeypatch.setattr(closing, "LAWS", {})
+    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+
+
+def settings_of(scans: Sequence[PrintedScan]) -> Study:
+    return replace(study_of(scans), scans=())
+
+
+def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:
+    return choose_base(base, scans, settings_of(scans), steps=None, cache=cache).model
+
+
+def trained(scans: Sequence[PrintedScan]) -> Simulator:
+    """The base with gain and offset of these scans; it has too many numbers to be fitted in a loop."""
+    model = base_model()
+    with torch.no_grad():
+        own = [model(torch.from_numpy(scan.layout_um)[None, None]).numpy().ravel() for scan in scans]
+        heights = np.concatenate([scan.height_um.ravel() for scan in scans])
+        gain, offset_um = np.polyfit(np.concatenate(own), heights, 1)
+        model.weights.mul_(gain)
+        model.offset_um.mul_(gain).add_(offset_um)
+    return model
+
+
+def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]:
+    return {
+        "fitted here": base_model(),
+        "trained per fold": train_folds(prepare_scans(scans), study.fold_of, trained),
+    }
+
+
+@pytest.mark.parametrize("base", ["fitted here", "trained per fold"])
+def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
+    base: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the training of the base to the law, the print and what scans share."""
+    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
+    scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
+    study = settings_of(scans)
+    out = np.flatnonzero(study.fold_of == 1).tolist()
+    other = [s.height_um + 0.2 * s.layout_um**2 if i in out else s.height_um for i, s in enumerate(scans)]
+    maps, fitted = [], []
+    for own in (scans, with_heights(scans, other)):
+        closed = close(own, study.fold_of, bases_of(own, study)[base], study, describe=False)
+        # With a law in the model: its number is fitted too.
+        state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
+        fitted.append(state.per_fold[1])
+        maps.append(np.stack([HeldOut(closed, study).maps_um(state)[i] for i in out]))
+    # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left; the
+    # heights were changed by up to 0.2 µm.
+    assert np.abs(maps[1] - maps[0]).max() < 1e-4
+    np.testing.assert_allclose(fitted[1], fitted[0], atol=1e-3)
+
+
+def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
+    scans = planted(count=6)
+    study = settings_of(scans)
+    model = bases_of(scans, study)["trained per fold"]
+    assert isinstance(model, FoldedBase)
+    assert len(model.models) == len(study.folds)
+    assert Twin.bare(model, study_of(scans).scans[0]).own == 0
+
+    def numbers(one: nn.Module) -> list[float]:
+        return [float(p.detach()) for p in one.parameters()]
+
+    for scan, fold in zip(scans, study.fold_of, strict=True):
+        rest = [own for own, of in zip(scans, study.fold_of, strict=True) if of != fold]
+        assert numbers(model.of_scan(scan.id)) == numbers(model.of_fold(int(fold))) == numbers(trained(rest))
+    assert numbers(model.of_scan("elsewhere")) == numbers(trained(scans))
+
+
+class Carrying(nn.Module):
+    """The base with the law in it, trained elsewhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.base = base_model().requires_grad_(False)
+
+    def forward(self, layout: torch.Tensor) -> torch.Tensor:
+        context = FieldContext(layout, PITCH_UM, (LEVELS - 1) * LEVEL_HEIGHT_UM)
+        return get_effect(LAW)(self.base(layout), STRENGTH, context)
+
+
+def test_what_a_trained_model_lacks_is_added_and_what_it_carries_is_not() -> None:
+    study = study_of(planted([(LAW, ALL, {"": STRENGTH})]))
+    for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
+        start = fit_state(Twin.bare(base, study.scans[0]), study)
+        found = search(start, study, [get_effect(LAW), get_effect("height-power-2")])
+        assert found.names == names
+        assert found.state.twin.own == 0
+        # White noise of 4 nm is all that is left.
+        assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.05)
+        if names:
+            assert found.state.twin.values({})[LAW] == pytest.approx(STRENGTH, rel=0.03)
+
+
+def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -> None:
+    scans = planted(count=4)
+    model = chosen("zoo:pbl", scans, tmp_path)
+    assert Twin.bare(model, study_of(scans).scans[0]).own == 0
+    coarse = [replace(scan, pitch_um=0.2) for scan in scans]
+    with pytest.raises(InputError, match=r"pitch of zoo:pbl, got 0.1 µm, wanted 0.2 µm"):
+        chosen("zoo:pbl", coarse, tmp_path)
+    # Nothing can be chosen anew of what is not fitted here.
+    store = write_store(tmp_path / "s.zarr", scans)
+    with pytest.raises(InputError, match="--nested with zoo:pbl"):
+        close_loop(store, tmp_path / "out", base="zoo:pbl", nested="prints")
+
+
+@pytest.mark.slow
+def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
+    """On a network trained per fold the same fits have the same error in both, to the bit of a float."""
+    store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=80, bow_um=0.02)), tmp_path / "l"
+    scored = benchmark(store, tmp_path / "b", models=["features"], folds=2).scores[0]
+    loop = close_loop(store, out, base="features", folds=2, cache=tmp_path / "b" / "cache")
+    first = loop.error("base", "offset", "published")
+    assert first is not None
+    # The same predictions, pixels, terms and background; sums in another order.
+    assert first.mae_nm == pytest.approx(scored.mae_datum_free_nm, abs=1e-6)
+    assert first.rmse_nm == pytest.approx(
+        np.sqrt(np.mean([row.rmse_datum_free_nm**2 for row in scored.scans])), abs=1e-6
+    )
+    assert first.by_scan_nm == pytest.approx({row.scan: row.mae_datum_free_nm for row in scored.scans})
+    # Not for want of a difference: without the background the same fits have another error.
+    bare = loop.error("base", "offset", "print alone")
+    assert bare is not None
+    assert abs(bare.mae_nm - first.mae_nm) > 0.1
+    # Nothing new was trained, and the model trained on all scans is saved.
+    assert ModelCard.read(out / "model").model == "features"
+    assert build_model("features").parameter_count == ModelCard.read(out / "model").parameters

@@ -1,0 +1,64 @@
+"""How small an effect would be found: a large one planted in copies is, a tiny one is not, the data stay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan
+from litho_models.effects import get_effect
+from litho_models.twin.closing import Closed
+from litho_models.twin.fits import fit_state, without_terms
+from litho_models.twin.model import Twin
+from litho_models.twin.planting import parse_planted, plant
+from litho_models.twin.search import search
+from tests.litho_models.twin_scans import base_model, planted, study_of
+
+LAW = "slope-x-power-1"
+
+
+def closed_on(scans: Sequence[PrintedScan]) -> Closed:
+    """The search among two laws, and nothing else of the loop."""
+    study = study_of(scans)
+    base = fit_state(Twin.bare(base_model(), study.scans[0]), study)
+    found = search(base, study, [get_effect(LAW), get_effect("height-power-2")])
+    return SimpleNamespace(base=base, original=study.scans, causes=found.causes, final=found.state)  # type: ignore[return-value]
+
+
+def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they_were() -> None:
+    scans = planted()
+    before = [scan.height_um.copy() for scan in scans]
+    closed = closed_on(scans)
+    large, tiny = (plant(f"{LAW}={amount}", closed, closed_on) for amount in (0.04, 0.0002))
+    assert (large.name, large.amount, large.unit) == (LAW, 0.04, get_effect(LAW).parameters["strength"].unit)
+    assert large.named == [LAW]
+    assert large.found == pytest.approx(0.04, rel=0.05)
+    assert (tiny.named, tiny.found) == ([], None)
+    assert all((a.height_um == b).all() for a, b in zip(scans, before, strict=True))
+    # So much smaller that the change is linear in the amount.
+    assert large.rms_nm / tiny.rms_nm == pytest.approx(0.04 / 0.0002, rel=1e-2)
+    changes = []
+    for scan in closed.original:
+        bare, there = closed.base.twin, {"": {"strength": 0.04}}
+        here = bare.placed().height(scan)
+        change = bare.with_effect(LAW, "all", there).placed().height(scan) - here
+        changes.append(np.mean(without_terms(scan.at_sample(change)[:, None], scan, here) ** 2))
+    assert large.rms_nm == pytest.approx(NM_PER_UM * np.sqrt(np.mean(changes)), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "text", ["vignetting", "vignetting=much", "vignetting=", "vignetting=inf", "nothing=1", "tilt-bow=0.1"]
+)
+def test_what_cannot_be_planted_is_refused(text: str) -> None:
+    with pytest.raises(InputError):
+        parse_planted(text)
+
+
+def test_a_name_and_an_amount_are_read() -> None:
+    effect, amount = parse_planted(" vignetting =0.1")
+    assert (effect.name, amount) == ("vignetting", 0.1)

@@ -1,0 +1,194 @@
+"""What single scans add is recognised for what it is, and what all of them share is not put down to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from litho_models.effects import get_effect
+from litho_models.scan_terms import SCAN_TERMS
+from litho_models.scan_terms.measurement import learn_measurement
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan, prepare_scans
+from litho_models.twin.record import ScanFinding
+from litho_models.twin.single_scans import SingleScans
+from tests.litho_models.twin_scans import base_model, planted, study_of, with_heights
+
+# Offsets of lines need two blocks of 32 px and a gap as wide on either side of what they are judged on.
+SIZE_PX, SMALL_PX = 160, 64
+# A scan line crosses four rows of the layout.
+ANGLE = np.deg2rad(1.5)
+TURNED = np.array([[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]])
+# Neither by print nor by field; their standard deviation is 1.05.
+SIGNS = (1, -1, -1, 1, 1, 1, -1, 1, -1, -1)
+Change = Callable[[PreparedScan, np.random.Generator], np.ndarray]
+
+
+def truths(scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+    placed = Twin.bare(base_model(), scans[0]).placed()
+    return [placed.height(scan) for scan in scans]
+
+
+def found_with(
+    change: Change, size_px: int = SIZE_PX, *, turned: bool = False, shared_known: bool = False, seed: int = 0
+) -> dict[str, ScanFinding]:
+    """What is found on ten scans with a change of their heights (y, x), µm, beside a datum each.
+
+    ``shared_known``: beside maps that have what all scans share.
+    """
+    random = np.random.default_rng(seed)
+    scans = planted(size_px=size_px, seed=seed)
+    if turned:
+        scans = [replace(scan, scan_to_layout=TURNED) for scan in scans]
+    heights = [scan.stored.height_um + change(scan, random) for scan in prepare_scans(scans)]
+    scans = with_heights(scans, heights)
+    study = study_of(scans)
+    maps = truths(study.scans)
+    if shared_known:
+        learned = learn_measurement(scans, maps)
+        maps = [learned.expected_um(scan, own) for scan, own in zip(scans, maps, strict=True)]
+    return {one.name: one for one in SingleScans(study, study.scans, maps).findings()}
+
+
+def seen(found: dict[str, ScanFinding]) -> set[str]:
+    return {name for name, one in found.items() if one.seen}
+
+
+def nothing(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
+    return np.zeros(scan.usable.shape)
+
+
+def stripes(size_um: float, *, written: bool = False) -> Change:
+    """An offset of each scan line, or of each row of the layout."""
+
+    def change(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
+        line = np.indices(scan.usable.shape)[0] if written else scan.line
+        return (size_um * random.normal(size=int(line.max()) + 1))[line]
+
+    return change
+
+
+def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
+    found = found_with(nothing, SMALL_PX)
+    assert seen(found) == {"datum-offset"}
+    assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect}
+    spread = found["datum-offset"].spread["offset_um"]
+    assert spread.ci95 is not None
+    # As drawn: of the base's own offset all scans have the same.
+    scans = planted(size_px=SMALL_PX)
+    drawn = [
+        np.mean(scan.height_um - own) for scan, own in zip(scans, truths(prepare_scans(scans)), strict=True)
+    ]
+    # White noise of 4 nm on 4,096 pixels: 0.06 nm.
+    assert spread.value == pytest.approx(np.std(drawn, ddof=1), rel=0.02)
+    assert spread.ci95[0] < spread.value < spread.ci95[1]
+
+
+def test_stripes_are_told_from_columns_and_not_from_the_rows_that_they_lie_on() -> None:
+    found = found_with(stripes(0.004))
+    one = found["scan-line-stripes"]
+    assert one.seen
+    # No scan is turned: the lines could as well have been written so.
+    assert one.confusable_with == ["line-roughness"]
+    assert "line-roughness" not in seen(found)
+    assert "cannot be told from scan-line-stripes" in found["line-roughness"].evidence
+    # Of 1,600 lines with a noise of 4 / sqrt(64) nm each; a line is known from the other side of its scan.
+    assert one.spread["sd_um"].value == pytest.approx(0.004, rel=0.08)
+    lines = stripes(0.004)
+    both = found_with(lambda scan, random: lines(scan, random) + lines(scan, random).T)
+    assert "scan-line-stripes" not in seen(both)
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_lines_of_the_print_are_told_from_lines_of_the_scan(written: bool) -> None:
+    found = found_with(stripes(0.006, written=written), turned=True)
+    right, wrong = ("line-roughness", "scan-line-stripes")[:: 1 if written else -1]
+    assert right in seen(found)
+    assert wrong not in seen(found)
+    assert found[wrong].confusable_with == found[right].confusable_with == []
+    assert f"more closely: {right}" in found[wrong].evidence
+
+
+def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None:
+    profile = gaussian_filter(np.random.default_rng(8).normal(size=(SIZE_PX, 1)), (2.0, 0.0))
+    profile *= 0.008 / profile.std()
+    found = found_with(lambda scan, random: profile * np.ones(SIZE_PX))
+    assert not seen(found) & {"scan-line-stripes", "line-roughness"}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
+    effect = get_effect("registration-residual")
+
+    def bent(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
+        # 0.1 µm at the rim against the middle, freed of its mean; one sign for all, or one for each.
+        size_um = 0.1 if shared else 0.1 * SIGNS[scan.stored.order]
+        values = {name: torch.zeros(()) for name in effect.parameters}
+        values |= {"x_by_xx_um": torch.tensor(size_um), "shift_x_um": torch.tensor(-size_um / 3)}
+        height = torch.from_numpy(scan.stored.height_um)[None, None]
+        return effect.apply(height, values, scan.context)[0, 0].numpy() - scan.stored.height_um
+
+    found = found_with(bent, SMALL_PX, shared_known=shared)["registration-residual"]
+    assert found.seen is not shared
+    spread = found.spread["x_by_xx_um"]
+    assert spread.unit == "µm"
+    # A central difference sees sin(k) / k of a slope, 0.84 at a wavelength of 6 px: what it explains by a
+    # displacement it takes for a larger one.
+    assert (spread.value < 0.01) if shared else (0.105 < spread.value < 0.105 / 0.8)
+
+
+@pytest.mark.parametrize("of_prints", [True, False])
+def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints: bool) -> None:
+    """Five prints of two scans each; the same gains, by print or across prints."""
+    gains = 0.02 * np.repeat([-2, -1, 0, 1, 2], 2)
+    gains = gains if of_prints else np.roll(gains, 1)
+
+    def stretched(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
+        height = scan.stored.height_um
+        return gains[scan.stored.order] * (height - height.mean())
+
+    one = found_with(stretched, SMALL_PX)["z-gain"]
+    assert one.seen
+    assert one.role == ("undetermined" if of_prints else "measurement")
+    assert one.spread["gain"].value == pytest.approx(np.std(gains, ddof=1), rel=0.05)
+
+
+# Mains hum: lines that repeat every 1.3 µm, in each scan with another phase.
+
+
+def humming(hum_um: float) -> Change:
+    lines = stripes(0.003)
+
+    def change(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
+        phase = 2 * np.pi * (np.arange(SIZE_PX) / 13 + random.random())
+        return hum_um * np.sin(phase)[:, None] + lines(scan, random)
+
+    return change
+
+
+def test_a_hum_is_found_with_its_period_and_its_share() -> None:
+    said = found_with(humming(0.004), seed=1)["scan-line-stripes"].evidence
+    period_um = float(said.split("repeat every ")[1].split(" µm")[0])
+    share = float(said.split("with ")[-1].split(" %")[0]) / 100
+    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide; its centre of mass is known better.
+    assert period_um == pytest.approx(1.3, abs=0.05)
+    # 4² / 2 = 8 nm² of hum beside 3² = 9 nm² of chance.
+    assert share == pytest.approx(8 / 17, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_lines_have_no_period(seed: int) -> None:
+    assert "repeat" not in found_with(humming(0.0), seed=seed)["scan-line-stripes"].evidence
+
+
+def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_the_same() -> None:
+    scans = [scan for size in (64, 80) for scan in planted(count=5, size_px=size, seed=size)]
+    scans = [replace(scan, id=f"S{at}", order=at) for at, scan in enumerate(scans)]
+    study = study_of(scans)
+    found = SingleScans(study, study.scans, truths(study.scans)).findings()
+    assert {one.name for one in found if one.seen} == {"datum-offset"}
