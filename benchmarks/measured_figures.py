@@ -1,4 +1,4 @@
-"""Figures of the measured run for the documentation."""
+"""The figure of a held-out prediction, for the documentation."""
 
 from __future__ import annotations
 
@@ -6,30 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.store import open_store
-
-_BASE, _CORRECTED = "#9aa5b1", "#0b6aa2"
-
-
-def draw_steps(errors_csv: Path, path: Path) -> None:
-    """Held-out error of the base and the corrected model as per-scan terms are freed."""
-    frame = pd.read_csv(errors_csv)
-    figure = new_figure(8, 0.36 * len(frame) + 1.0)
-    axes = figure.subplots()
-    y = np.arange(len(frame))[::-1]
-    mae = frame["MAE (nm)"].to_numpy()
-    spread = np.abs(np.stack([mae - frame["low"], frame["high"] - mae]))
-    colours = [_BASE if str(label).startswith("base") else _CORRECTED for label in frame["model"]]
-    axes.barh(y, mae, xerr=spread, color=colours, height=0.66)
-    for position, value, high in zip(y, mae, frame["high"], strict=True):
-        axes.annotate(f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center")
-    axes.set_yticks(y, frame["model"])
-    axes.set_xlabel("mean absolute error on held-out scans (nm)")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110)
 
 
 def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl") -> None:

@@ -1,8 +1,7 @@
-"""Tables of the measured run: models on held-out scans, the noise beside them, designs through them."""
+"""Tables of the measured run: models on held-out scans, and the noise beside them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -10,7 +9,6 @@ from benchmarks.markdown_table import markdown_table, with_interval
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores
 
-PAPER_MODELS = {"physics", "pbl", "fno"}
 _FREE = {
     "none": "nothing",
     "offset": "offset",
@@ -65,17 +63,18 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         without, relaxed = f"{bare['offset']:.2f} nm", f"{policies['full']:.2f} nm"
         rows.append((score["model"], free, without, relaxed, absolute, f"{parameters[score['model']]:,}"))
     floor = noise["noise_floor"]
-    rows.append(floor_row(floor, "offset", None, "full", "none", None))
+    rows.append(_floor_row(floor, "offset", None, "full", "none", None))
     split = benchmark["split"]
     return markdown_table(
         heads,
         rows,
         f"Mean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
         f"by scan, seed {split['seed']}; {len(split['lock_box'])} locked scans are in no fold and in no "
-        f"figure of this table; {steps_text(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan "
-        "terms are fitted on pixels that are not scored. The shared background is what levelling leaves in "
-        "every map: five numbers from the training scans, added to predictions of measured maps and to no "
-        "design. The noise is an upper estimate ([how](../../noise.md)), its intervals are over prints. "
+        f"figure of this table; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. "
+        "Per-scan terms are fitted on pixels that are not scored. The shared background is what levelling "
+        "leaves in every map: five numbers from the training scans, added to predictions of measured maps "
+        "and to no design. The noise is an upper estimate ([how](../../noise.md)), its intervals are over "
+        "prints. "
         f"At least what an error has above it can still be won: at k = 1 and 7 {_above(benchmark, floor)}.",
     )
 
@@ -90,7 +89,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         full = next(entry["mae_nm"] for entry in score["by_policy"] if entry["policy"] == "full")
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
         rows.append((name, f"{parameters[name]:,}", free, f"{full:.2f} nm"))
-    no_model = floor_row(noise["noise_floor"], None, "offset", "full")
+    no_model = _floor_row(noise["noise_floor"], None, "offset", "full")
     rows.append(("what the layout cannot tell, at most", *no_model[1:]))
     rows.append(("PBL in the paper: other split, levelling and zero", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
@@ -104,67 +103,6 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         "a print are not independent: with 6 prints no sign-flip test goes below p = 0.031. The last row but "
         "one is an upper estimate for models of the layout alone; it counts what place, field and print "
         "share as noise.",
-    )
-
-
-def paired_table(benchmark: dict[str, Any]) -> str:
-    """How much better each model is than each other, scan by scan."""
-    rows = [
-        (
-            f"{pair['first']} − {pair['second']}",
-            with_interval(pair["mean_nm"], pair["ci95_nm"]),
-            f"{pair['p']:.4f}",
-            _over_prints(pair.get("over_prints")),
-        )
-        for pair in benchmark["paired"]
-        if {pair["first"], pair["second"]} <= {"linear", "features", "random-features", *PAPER_MODELS}
-    ]
-    return markdown_table(
-        ("difference", "datum-free error, k = 1, over scans", "p", "over prints"),
-        rows,
-        "On the pixels of the table above. Intervals resample scans, p is of a sign-flip test over scans: "
-        "they need not agree at the border. Scans of a print are not independent; over six prints a "
-        "sign-flip test cannot go below p = 0.031.",
-    )
-
-
-def _over_prints(units: dict[str, Any] | None) -> str:
-    if units is None:
-        return "not recorded"
-    interval = "" if units["ci95_nm"] is None else "{:.2f} … {:.2f}, ".format(*units["ci95_nm"])
-    return f"{interval}p = {units['p']:.3f} ({units['count']} prints)"
-
-
-def further_table(benchmark: dict[str, Any]) -> str:
-    """Phase, similarity, edges, crops, and training against held-out error, one row per model."""
-    heads: tuple[str, ...] = ("model", "phase", "SSIM", "edges, mean", "edges, P95", "edges without partner")
-    heads += ("other crop, largest", "on training scans", "on inner validation", "held out")
-    rows: list[tuple[str, ...]] = []
-    for score in benchmark["scores"]:
-        found = [fit["diagnostics"] for fit in benchmark["fits"] if fit["model"] == score["model"]]
-        lost = score["edge_unmatched"] / (score["edge_matched"] + score["edge_unmatched"])
-        crops = [entry["tiles"]["max_nm"] for entry in found if entry["tiles"]]
-        errors = [
-            _mean_nm([entry[key] for entry in found])
-            for key in ("training_nm", "inner_validation_nm", "held_out_nm")
-        ]
-        rows.append(
-            (
-                score["model"],
-                f"{score['phase_rms_waves']:.4f} waves",
-                f"{score['ssim']:.3f}",
-                f"{score['edge_mean_nm']:.0f} nm",
-                f"{score['edge_p95_nm']:.0f} nm",
-                f"{100 * lost:.1f} %",
-                f"{max(crops):.2g} nm" if crops else "–",
-                *errors,
-            )
-        )
-    return markdown_table(
-        heads,
-        rows,
-        "The definitions are in [how models are judged](../../evaluation.md). The last three columns are "
-        "datum-free errors without the shared background, means over folds.",
     )
 
 
@@ -202,101 +140,7 @@ def noise_table(noise: dict[str, Any]) -> str:
     return f"{by_terms}\n\n{by_level}"
 
 
-def texture_table(textures: Sequence[dict[str, Any]], *notes: str) -> str:
-    """Direction and strongest period of the roughness, one row an axis."""
-    rows: list[tuple[str, ...]] = []
-    for one in textures:
-        for lines in one["lines"]:
-            period = lines["period"]
-            rows.append(
-                (
-                    one["id"],
-                    str(one["surfaces"]),
-                    f"{one['angle_deg']:.1f}°, strength {one['strength']:.2f} "
-                    f"({_chance(one['isotropic_p'])})",
-                    f"along {lines['along']}: {100 * lines['share']:.0f} %",
-                    f"{period['period_um']:.3g} µm, {period['amplitude_nm']:.1f} nm, "
-                    f"{100 * period['share']:.0f} %",
-                    f"{period['p']:.2g}",
-                    "" if period["coherence_p"] is None else f"{period['coherence']:.2f}",
-                )
-            )
-    return markdown_table(
-        (
-            "surface",
-            "maps",
-            "lines lie at",
-            "variance in means of lines",
-            "strongest period, amplitude, share of the means' squares",
-            "its p",
-            "one phase",
-        ),
-        rows,
-        *notes,
-    )
-
-
-def _chance(p: float) -> str:
-    """A p that is 0 in double precision is below the smallest number there."""
-    return f"p = {p:.0e}" if p else "p < 1e-300"
-
-
-def coverage_table(noise: dict[str, Any]) -> str:
-    """How many pixels lie within the stated intervals, over all and by level and slope."""
-    spread = noise["spread"]
-
-    def share(value: float, interval: Sequence[float] | None) -> str:
-        ends = f" ({100 * interval[0]:.1f} … {100 * interval[1]:.1f})" if interval else ""
-        return f"{100 * value:.1f} %{ends}"
-
-    total = spread["bins"][0]["pixels"]
-    rows: list[tuple[str, ...]] = []
-    for row in spread["bins"]:
-        if row["covariate"] not in ("all", "level", "slope") or row["pixels"] < 0.01 * total:
-            continue
-        place = {"all": "all pixels", "level": f"level {row['low']:.0f}"}.get(
-            row["covariate"], f"slope {row['low']:.2f} … {row['high']:.2f}"
-        )
-        rows.append(
-            (
-                place,
-                f"{100 * row['pixels'] / total:.1f} %",
-                share(row["coverage_68"], row["coverage_68_ci95"]),
-                share(row["coverage_95"], row["coverage_95_ci95"]),
-                f"{row['ence']:.3f}",
-                f"{row['ause']:.3f}",
-            )
-        )
-    freedom = spread["variance"]["freedom"]
-    tails = f"Student's t with {freedom:g} degrees of freedom" if freedom else "a Gaussian"
-    return markdown_table(
-        ("", "pixels", "within the 68 % interval", "within the 95 % interval", "ENCE", "AUSE"),
-        rows,
-        f"Residuals of `{spread['model']}` at k = {spread['nuisance']['k']:g}; σ(x) and tails are fitted "
-        f"without the print that they are judged on (on all prints: {tails}), intervals are over prints. "
-        "Levels with less than 1 % of the pixels are left out.",
-    )
-
-
-def design_table(gap: dict[str, Any]) -> str:
-    """Image quality of every arm's hologram under every judge."""
-    judges = list(dict.fromkeys(entry["judge"] for entry in gap["summary"]))
-    found = {
-        (entry["arm"], entry["judge"]): entry["judged_mean"]
-        for entry in gap["summary"]
-        if entry["figure"] == "si_psnr_db"
-    }
-    settings = gap["settings"]
-    return markdown_table(
-        ("designed with", *(f"judged by {judge}" for judge in judges)),
-        [(arm, *(f"{found[arm, judge]:.2f} dB" for judge in judges)) for arm in gap["arms"]],
-        "Scale-invariant PSNR of the hologram that the printed argmax layout makes, "
-        f"{settings['layout']['size_px']} px, {settings['search']['iterations']} iterations, seeds "
-        f"{gap['seeds']}: one small task, no ranking beyond it.",
-    )
-
-
-def floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
+def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
     """The noise under columns of errors, each with the scan terms of its column; None: nothing to compare."""
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
@@ -314,12 +158,7 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def steps_text(benchmark: dict[str, Any]) -> str:
+def _steps_text(benchmark: dict[str, Any]) -> str:
     """Optimiser steps of the networks."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())
-
-
-def _mean_nm(values: list[float | None]) -> str:
-    known = [value for value in values if value is not None]
-    return f"{sum(known) / len(known):.2f} nm" if known else "–"

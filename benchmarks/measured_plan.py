@@ -20,13 +20,13 @@ from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
-from litho_models.loop.result.questions import OpenQuestions
-from litho_models.loop.run import MODEL_FOLDER
-from litho_models.planning.designer import as_tensor
 from litho_models.planning.folder import HOLDS
+from litho_models.planning.layouts import as_tensor
+from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
 from litho_models.planning.report import prints_figure
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.twin.saving import MODEL_FOLDER
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "next-print"
@@ -69,7 +69,7 @@ def draw(plan: NextPrint, loop: Path) -> None:
     printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
     rivalry = Rivalry(question, load_simulator(loop / MODEL_FOLDER, card), printing, open_.noise)
     last = [scan for scan in plan.scans if scan.print == "1"][-1]
-    way = Way(last.turned_deg, last.direction < 0, last.tip != 1, last.pixel_size != 1)
+    way = Way(last.turned_deg, last.direction, last.tip, last.pixel_size)
     shown = PlannedPrint(as_tensor(levels["print 1"]), (way,))
     prints_figure(rivalry, shown).savefig(RESULTS / "rivals.jpg", dpi=80)
 

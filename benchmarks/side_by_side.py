@@ -14,7 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from benchmarks.record import conclude, options, origin, usable_cores
 from litho_design.optimisation.budget import peak_memory_gib
 from litho_design.printers.source import check_device
 from litho_models.frozen import zoo
+from litho_models.models.pbl import Pbl, PblConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
 RESULTS = PAGE.parent / "results" / "speed"
@@ -42,12 +44,35 @@ Arrays = Mapping[str, np.ndarray]
 Work = tuple[Callable[[], object], Callable[[], Arrays]]
 
 
-def parser(description: str | None, name: str, repeats: int, size_px: int) -> argparse.ArgumentParser:
-    """The options that all comparisons have."""
-    found = options(description, "write the table into docs/speed.md", RESULTS / f"{name}.json")
+@dataclass(frozen=True)
+class Comparison:
+    """One task, done by several sides.
+
+    Attributes:
+        name: of the record and of its place in the page.
+        sides: their names, the plain one among them.
+        size_px: of the field, unless it is given.
+        work: of a side: a function that does the task once, and one that returns what it made.
+        limit_gflop: of a side and a size: convolutions of one task per dtype, GFLOP, without margins.
+        differences: figures of what a side made, given what the plain one made and the receptive radius.
+    """
+
+    name: str
+    sides: Sequence[str]
+    size_px: int
+    work: Callable[[str, argparse.Namespace], Work]
+    limit_gflop: Callable[[PblConfig, str, int], Mapping[str, float]]
+    differences: Callable[[Arrays, Arrays, int], Mapping[str, float]]
+
+
+def parser(description: str | None, tasks: Iterable[str]) -> argparse.ArgumentParser:
+    """The options of a comparison."""
+    found = options(description, "write the table into docs/speed.md")
+    found.add_argument("task", choices=list(tasks))
+    found.add_argument("--out", type=Path, help="JSON file to write")
     found.add_argument("--model", type=Path, default=zoo.folder("pbl"), help="frozen PBL; default: the zoo's")
-    found.add_argument("--size-px", type=int, default=size_px)
-    found.add_argument("--repeats", type=int, default=repeats)
+    found.add_argument("--size-px", type=int)
+    found.add_argument("--repeats", type=int, default=7)
     found.add_argument("--threads", type=int, default=usable_cores())
     found.add_argument("--device", default="cpu", help="cpu, or a GPU: cuda")
     found.add_argument("--side", help=argparse.SUPPRESS)
@@ -55,40 +80,27 @@ def parser(description: str | None, name: str, repeats: int, size_px: int) -> ar
     return found
 
 
-def run(
-    module: str,
-    name: str,
-    arguments: argparse.Namespace,
-    sides: Sequence[str],
-    work: Callable[[str, argparse.Namespace], Work],
-    limit_gflop: Callable[[str, argparse.Namespace], Mapping[str, float]],
-    differences: Callable[[Arrays, Arrays], Mapping[str, float]],
-    **facts: Any,
-) -> None:
+def run(module: str, task: Comparison, pbl: Pbl, arguments: argparse.Namespace) -> None:
     """Measure all sides, print, write, publish; or do the work of one side in this process.
 
     Args:
         module: what ``python -m`` runs.
-        name: of the record and of its place in the page.
+        pbl: the network that is compared.
         arguments: of ``parser``.
-        sides: their names, the plain one among them.
-        work: of a side: a function that does the task once, and one that returns what it made.
-        limit_gflop: of a side: convolutions of one task per dtype, GFLOP, without margins.
-        differences: figures of what a side made, given what the plain one made.
-        facts: further entries of the record.
     """
+    name, sides = task.name, task.sides
+    arguments.size_px = arguments.size_px or task.size_px
     torch.set_num_threads(arguments.threads)
     check_device(arguments.device)
     device = torch.device(arguments.device)
     if arguments.side:
-        _serve(*work(arguments.side, arguments), arguments.arrays, device)
+        _serve(*task.work(arguments.side, arguments), arguments.arrays, device)
         return
     peaks = _peaks_gflops(device)
     cpu_peaks = _peaks_gflops(torch.device("cpu"))
     if device.type == "cuda":
         name = f"{name}_gpu"
         sides = [side for side in sides if side not in _CPU_ONLY] + [ON_CPU]
-        arguments.out = arguments.out.with_name(f"{name}.json")
     with tempfile.TemporaryDirectory() as folder:
         measured = _in_turns(module, arguments, sides, Path(folder))
         made = {side: dict(np.load(_arrays_file(Path(folder), side))) for side in sides}
@@ -96,7 +108,7 @@ def run(
     rows = []
     for side, row in measured.items():
         on_cpu = side == ON_CPU
-        work_gflop = limit_gflop("float32" if on_cpu else side, arguments)
+        work_gflop = task.limit_gflop(pbl.config, "float32" if on_cpu else side, arguments.size_px)
         rates = cpu_peaks if on_cpu else peaks
         rows.append(
             {
@@ -106,13 +118,12 @@ def run(
                 "memory": row["peak_gib"] / plain["peak_gib"],
                 "gflop": sum(work_gflop.values()),
                 "limit_s": sum(gflop / rates[dtype] for dtype, gflop in work_gflop.items()),
-                **differences(made[side], made[PLAIN]),
+                **task.differences(made[side], made[PLAIN], pbl.reach_px),
             }
         )
     record = {
         "schema": SCHEMA,
         "size_px": arguments.size_px,
-        **facts,
         "repeats": arguments.repeats,
         "machine": {
             "cores": usable_cores(),
@@ -125,7 +136,8 @@ def run(
         **({"cpu_peak_gflops": cpu_peaks} if device.type == "cuda" else {}),
         "sides": rows,
     }
-    conclude(record, as_markdown(record), arguments.out, PAGE, name, published=arguments.publish)
+    out = arguments.out or RESULTS / f"{name}.json"
+    conclude(record, as_markdown(record), out, PAGE, name, published=arguments.publish)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
@@ -235,7 +247,7 @@ def _in_turns(
 def _start(module: str, arguments: argparse.Namespace, side: str, folder: Path) -> subprocess.Popen[str]:
     device = "cpu" if side == ON_CPU else arguments.device
     does = "float32" if side == ON_CPU else side
-    command = [sys.executable, "-m", module, "--side", does, "--device", device]
+    command = [sys.executable, "-m", module, arguments.task, "--side", does, "--device", device]
     command += ["--arrays", str(_arrays_file(folder, side))]
     for option in ("model", "size_px", "threads"):
         command += [f"--{option.replace('_', '-')}", str(getattr(arguments, option))]

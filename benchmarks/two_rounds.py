@@ -25,26 +25,18 @@ from scipy.stats import binomtest
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
 from litho_data.build.build import build_dataset
-from litho_data.build.gratings import grating_scans
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
-from litho_models.fitting.runs import level_share
-from litho_models.frozen.files import save_frozen
-from litho_models.loop import LoopConfig, close_loop
-from litho_models.loop.findings import LoopFindings
-from litho_models.loop.open_questions import open_questions
-from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.result.questions import OpenQuestions
-from litho_models.loop.result.record import Decision
-from litho_models.loop.result.summary import summarise
-from litho_models.loop.run import MODEL_FOLDER
-from litho_models.loop.second_round import MICROSCOPE, PRINTER, decide
-from litho_models.models import build_model
+from litho_models.planning.deciding import MICROSCOPE, PRINTER, decide
+from litho_models.planning.open_questions import open_questions
+from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import PlannedQuestion
 from litho_models.planning.run import next_print
-from litho_models.simulator import Simulator
+from litho_models.twin.closing import Closed
+from litho_models.twin.record import CloseLoop, Decision
+from litho_models.twin.run import close_loop
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "two-rounds"
@@ -60,6 +52,8 @@ DEALT = (
     "diffusion-blur",
     "slope-thinning",
 )
+# The board is about what prints decide: one base, the form of the fab's own.
+BASE = "physics"
 SCANS, PRINTS = 14, 4
 RMS_NM = (12.0, 30.0)
 # Bins of the predicted power.
@@ -131,7 +125,13 @@ def run_trial(
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
     build_dataset(card, folder / "first.zarr")
-    findings, questions = first_round(folder)
+    asked: list[tuple[Closed, OpenQuestions]] = []
+
+    def ask(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[OpenQuestions]]:
+        asked.append((closed, open_questions(closed, result, report)))
+        return result, [asked[-1][1]]
+
+    result = close_loop(folder / "first.zarr", folder / "loop", base=BASE, further=ask)
     answers: dict[str, Any] = {}
     for arm in arms:
         plan = next_print(
@@ -149,44 +149,24 @@ def run_trial(
         )
         build_dataset(printed, folder / f"{arm}.zarr")
         store = open_store(folder / f"{arm}.zarr")
-        new, gratings = prepare_scans(store.scans()), grating_scans(store)
         planned = {q.name: q for q in plan.questions}
         answers[arm] = [
-            judged(one, planned[one.question], draw["knob"])
-            for one in decide(findings, questions, new, gratings=gratings)
+            judged(one, planned[one.question], draw["knob"]) for one in decide(*asked[0], store.scans())
         ]
     return {
         **draw,
         "strength": found.setting.strength,
         "reached_rms_nm": found.rms_nm,
-        "named": findings.search.names,
+        "named": [one.name for one in result.effects],
         "answers": answers,
     }
-
-
-def first_round(folder: Path) -> tuple[LoopFindings, OpenQuestions]:
-    """The loop on the first store; its questions and its base model go into ``loop``."""
-    store = open_store(folder / "first.zarr")
-    base = build_model(
-        "physics", pitch_um=store.pitch_um, level_height_um=store.level_height_um, levels=store.levels
-    )
-    findings = close_loop(store.scans(), base, LoopConfig.model_validate({}), lock_box=store.locked_ids)
-    result = summarise(findings, dataset=store.dataset_id, base_name="physics", dropped=[])
-    shares = level_share([scan.stored for scan in findings.development])
-    questions = open_questions(findings, result, shares)
-    (folder / "loop").mkdir(exist_ok=True)
-    questions.write(folder / "loop")
-    fitted = findings.search.state.fits.chain.base
-    assert isinstance(fitted, Simulator)
-    save_frozen(fitted, folder / "loop" / MODEL_FOLDER, name="first round")
-    return findings, questions
 
 
 def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str, Any]:
     """One answer beside the truth and the predicted power."""
     truth = KNOBS[knob]
     owner = MICROSCOPE if truth.role == "measurement" else PRINTER
-    asked = {truth.effect, owner} & set(decision.declared)
+    asked = {truth.effect, f"{truth.effect} as {owner}'s", owner} & set(decision.declared)
     return {
         "question": decision.question,
         "kind": decision.kind,

@@ -19,7 +19,6 @@ import argparse
 from pathlib import Path
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.measured_models import texture_table
 from benchmarks.record import publish
 from litho_data.foundation.commands import run_script
 from litho_data.virtual_fab.settings import Noise
@@ -37,11 +36,6 @@ def texts(folder: Path) -> dict[str, str]:
     return {
         "dose matrix": dose_table(doses),
         "planted roughness": planted_text(references),
-        "planted lines": texture_table(
-            [one.model_dump() for one in references.references.textures],
-            "Virtual prints: the flat print has line-shaped roughness along x and no period, the substrate "
-            "offsets of the scan lines, along x too.",
-        ),
     }
 
 

@@ -16,11 +16,10 @@ if TYPE_CHECKING:
     from litho_models.frozen.files import save_frozen as save_frozen
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
-    from litho_models.loop import LoopConfig as LoopConfig
-    from litho_models.loop import close_loop_on_store as close_loop  # noqa: F401
     from litho_models.models import build_model as build_model
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
+    from litho_models.planning.rounds import close_loop as close_loop
     from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
     from litho_models.simulator import Simulator as Simulator
@@ -31,13 +30,12 @@ else:
         __name__,
         {
             "FrozenSimulator": "litho_models.frozen.simulator",
-            "LoopConfig": "litho_models.loop",
             "PatchDataset": "litho_models.fitting.patches",
             "Simulator": "litho_models.simulator",
             "analyse_noise": "litho_models.noise",
             "benchmark": "litho_models.evaluation.benchmark",
             "build_model": "litho_models.models",
-            "close_loop": "litho_models.loop:close_loop_on_store",
+            "close_loop": "litho_models.planning.rounds",
             "compare": "litho_models.evaluation.compare",
             "evaluate": "litho_models.evaluation.evaluate",
             "freeze": "litho_models.frozen.freezing",

@@ -1,7 +1,4 @@
-"""Typical mistakes with the three commands and the packages, made in a small world; writes docs/mistakes.md.
-
-``python -m tests.mistakes`` writes the page anew from what was really said.
-"""
+"""Typical mistakes with the three commands and the packages, made in a small world."""
 
 from __future__ import annotations
 
@@ -23,7 +20,6 @@ from unittest.mock import patch
 
 import numpy as np
 
-PAGE = Path(__file__).parents[1] / "docs" / "mistakes.md"
 # Asked where there is no torch, which `pip install litholoop` alone does not bring.
 NO_TORCH = "litho-models zoo list"
 # By theme, what was done: a command line, or a statement of Python.
@@ -244,37 +240,3 @@ def answer(mistake: str) -> tuple[int | str, str]:
         except SystemExit as stop:
             return stop.code if isinstance(stop.code, int) else 1, told.getvalue()
     return 0, told.getvalue()
-
-
-def page_row(did: str, mistake: str, said: str) -> str:
-    """The row of the page: what was done, and the one line that was said."""
-    return f"| {did} | `{mistake}` | {_cell(said)} |"
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_")
-
-
-def page() -> str:
-    """The page, made of what is said to each mistake in a world of its own."""
-    count = sum(map(len, MISTAKES.values()))
-    lines = [
-        "# Typical mistakes",
-        "",
-        f"{count} mistakes that people make, and what the commands and packages say to each: what is wrong,",
-        "what was found, what was wanted, and the way out. A command ends with exit code 2 and has changed",
-        "nothing; Python raises `litho_data.InputError`. Anything else, a traceback above all, is a defect.",
-        "",
-        "This table is written by `python -m tests.mistakes`, and the tests hold it to what is said today.",
-    ]
-    for theme, mistakes in MISTAKES.items():
-        lines += ["", f"## {theme}", "", "| what was done | as | what it says |", "|---|---|---|"]
-        for did, mistake in mistakes.items():
-            lines.append(page_row(did, mistake, answer(mistake)[1].strip().splitlines()[-1]))
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    with world():
-        made = page()
-    PAGE.write_text(made, encoding="utf-8")

@@ -28,7 +28,7 @@ ROOMS = {
     ),
     "litho_models": (
         "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
-        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning", "twin",
+        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "twin", "planning",
         "cli",
     ),
     "litho_design": (

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.test_capabilities import ANYWHERE, commands
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -83,6 +85,28 @@ def test_every_page_is_on_the_site():
     written = {page.relative_to(DOCS).as_posix() for page in PAGES[1:]}
     assert {name for name in named if not name.startswith("reference/")} == written
     assert len(named) == len(set(named))
+
+
+def misspelt(text: str, known: dict[str, set[str]]) -> list[str]:
+    """Command lines in code blocks and in the text whose command or option does not exist."""
+    lines = re.findall(r"^(?:torchrun .*? )?(litho-(?:data|models|design) .*)$", text, re.MULTILINE)
+    lines += re.findall(r"`(litho-(?:data|models|design) [^`]*)`", text)
+    found = []
+    for line in (line.partition("#")[0] for line in lines):
+        words = line.split()
+        name = next((name for n in (3, 2) if (name := " ".join(words[:n])) in known), "")
+        options = set(re.findall(r"(?<!\S)--[a-z][\w-]*", line))
+        if not name or options - known[name] - ANYWHERE:
+            found.append(line)
+    return found
+
+
+def test_commands_and_options_of_the_pages_exist():
+    known = commands()
+    texts = {page.name: page.read_text("utf-8").replace("\\\n", " ") for page in PAGES}
+    assert {name: lines for name, text in texts.items() if (lines := misspelt(text, known))} == {}
+    wrong = "litho-data bild x\nlitho-data build x --out y\n`litho-data build x --oot y`"
+    assert misspelt(wrong, known) == ["litho-data bild x", "litho-data build x --oot y"]
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from benchmarks.blind_trials.campaign import (
     run_one,
 )
 from benchmarks.blind_trials.records import Board
-from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish, trial_table
+from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish_scoreboard, trial_table
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
@@ -89,7 +89,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
     scoreboard.write(out)
     trial_table(scoreboard).to_csv(out / "scoreboard.csv", index=False)
     if arguments.publish:
-        publish(PAGE, scoreboard)
+        publish_scoreboard(PAGE, scoreboard)
         scoreboard.write(results_of(board, seed))
     for what, value, wanted in figures_of(scoreboard):
         print(f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else ""))

@@ -14,25 +14,34 @@ from benchmarks.blind_trials.records import Draw, Found, Outcome, Planted, Verdi
 from litho_data.register.resample import resample_to_layout
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab import Job, Noise, scan_job
+from litho_models.effects import CATALOGUE
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.groups import label_of
+from litho_models.twin.errors import error_rows
 from litho_models.twin.record import CloseLoop
-from litho_models.twin.results import error_rows
 
 # A form that is right under the name of a family only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
+# Made of offsets of lines: to see those is to notice it.
+_OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def found_by(result: CloseLoop) -> list[Found]:
-    """What the loop reports: causes, laws and descriptions, and what it sees without a model."""
+    """What the loop reports: causes, laws and descriptions, and what it sees in single scans."""
     added = [
         Found(names=[one.name, *one.confusable_with], knowledge=one.knowledge, by=one.by)
         for one in result.effects
     ]
-    known = {name for one in added for name in one.names}
-    seen = [one.name for one in result.candidates if one.verdict == "explained" and one.name not in known]
-    return added + [Found(names=[name], knowledge="cause", by="all") for name in seen]
+    seen = [one for one in result.single_scans if one.seen]
+    return added + [
+        Found(names=[one.name, *one.confusable_with], knowledge="cause", by="scan") for one in seen
+    ]
+
+
+def _beyond_noise(found: Sequence[Found]) -> list[Found]:
+    """Without what the fab's default noise has in every scan: datum, bow, offsets of lines, their like."""
+    return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
 
 def judge(
@@ -47,7 +56,8 @@ def judge(
     What the loop reports counts for one cause at most, for the larger one first.
     """
     found = found_by(result)
-    left = bool(found) or result.verdict == "unexplained" or any(one.matters for one in result.explained[-1:])
+    rest = result.verdict == "unexplained" or any(one.matters for one in result.explained[-1:])
+    left = rest or bool(_beyond_noise(found))
     if not draw.causes:
         return [Outcome(name="none", verdict="false-positive" if left else "clean")]
     verdicts: dict[str, Verdict] = {}
@@ -65,7 +75,8 @@ def judge(
     for one in causes:
         if one.draw.name not in verdicts:
             absorbed = draw.kind == "alias" and not one.counts and _is_absorbed(one, result)
-            silent: Verdict = "absorbed" if absorbed else "noticed" if left else "missed"
+            lines = one.draw.name == _OF_LINES and any(_LINES in other.names for other in found)
+            silent: Verdict = "absorbed" if absorbed else "noticed" if left or lines else "missed"
             verdicts[one.draw.name] = "lawful" if laws > 0 else silent
             laws -= 1
     return [Outcome(name=one.name, verdict=verdicts[one.name]) for one in draw.causes]
@@ -75,7 +86,7 @@ def false_names(planted: Sequence[Planted], result: CloseLoop) -> list[str]:
     """Sets of causes that the loop named and that have nothing of what was planted, base included."""
     return [
         " | ".join(named.names)
-        for named in found_by(result)
+        for named in _beyond_noise(found_by(result))
         if named.knowledge == "cause" and not any(_is_right(one, named, result) for one in planted)
     ]
 

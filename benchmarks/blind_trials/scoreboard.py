@@ -12,8 +12,9 @@ from scipy.stats import binomtest
 
 from benchmarks.blind_trials.other_forms import FORMS
 from benchmarks.blind_trials.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import publish
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
 from litho_data.foundation.run_facts import run_info
 
 # Largest error after that is accepted, as a multiple of that of the true models.
@@ -22,7 +23,6 @@ TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
 _LAWFUL: tuple[Verdict, ...] = (*_NAMED, "lawful")
 _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
-_END = "<!-- end of scoreboard -->"
 
 
 class Figure(NamedTuple):
@@ -203,7 +203,7 @@ def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def publish(page: Path, scoreboard: Scoreboard) -> None:
+def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
     """Put the figures into the page, in place of what stood between the marks of the board.
 
     Raises:
@@ -211,35 +211,15 @@ def publish(page: Path, scoreboard: Scoreboard) -> None:
     """
     if scoreboard.pending:
         raise InputError("scoreboard to publish", got=f"pending trials {scoreboard.pending}", wanted="none")
-    before, _, after = _parts(page, scoreboard)
-    with atomic_file(page) as temporary:
-        text = f"{before}{_start(scoreboard)}\n{as_markdown(scoreboard)}\n{_END}{after}"
-        temporary.write_text(text, encoding="utf-8")
+    publish(page, mark_of(scoreboard), as_markdown(scoreboard))
 
 
-def published(page: Path, scoreboard: Scoreboard) -> str:
-    """What stands between the marks of a board.
-
-    Raises:
-        InputError: a page without the marks.
-    """
-    return _parts(page, scoreboard)[1].strip("\n")
+def mark_of(scoreboard: Scoreboard) -> str:
+    """What the marks of a board in the page are called."""
+    return f"board of {scoreboard.board} {scoreboard.seed}"
 
 
 def as_markdown(scoreboard: Scoreboard) -> str:
     """Command and figures."""
-    rows = "\n".join(f"| {what} | {value} | {wanted} |" for what, value, wanted in figures_of(scoreboard))
-    return f"```\n{scoreboard.command}\n```\n\n| | | wanted |\n|---|---|---|\n{rows}"
-
-
-def _start(scoreboard: Scoreboard) -> str:
-    return f"<!-- board of {scoreboard.board} {scoreboard.seed}: written by the command -->"
-
-
-def _parts(page: Path, scoreboard: Scoreboard) -> tuple[str, str, str]:
-    start = _start(scoreboard)
-    before, found, rest = page.read_text(encoding="utf-8").partition(start)
-    inside, end, after = rest.partition(_END)
-    if not found or not end:
-        raise InputError(f"marks in {page}", got="not both", wanted=f"{start} … {_END}")
-    return before, inside, after
+    rows = [tuple(figure) for figure in figures_of(scoreboard)]
+    return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'wanted'), rows)}"

@@ -15,7 +15,7 @@ from benchmarks.blind_trials.records import Draw, Draws, Outcome, Planted, Trial
 from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
-from litho_models.twin.run import close_store
+from litho_models.twin.run import close_loop
 
 
 def trial_folder(out: Path, number: int) -> Path:
@@ -64,7 +64,7 @@ def run_trial(
             card = write_raw(draw, planted, jobs, folder / "raw")
             started_s = _cpu_s()
             build_dataset(card, store)
-        result = close_store(store, folder / "loop", base=draws.base, report=report)
+        result = close_loop(store, folder / "loop", base=draws.base, report=report)
         used_s = _cpu_s() - started_s
         report("judging")
         locked = set(result.split.lock_box)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -24,9 +23,7 @@ NAME = "gap"
 RESULT_FILE, TABLE_FILE = "gap.json", "gap.csv"
 
 
-def write_results(
-    out: Path, plan: Plan, tasks: Sequence[Task], expected: Sequence[Mapping[str, Any]]
-) -> Path:
+def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
     """Write ``results/`` of a finished comparison: JSON, CSV and figures; returns the folder."""
     folder = out / "results"
     folder.mkdir(exist_ok=True)
@@ -45,13 +42,12 @@ def write_results(
                 "iterations": gap.settings.search.iterations,
                 "seeds": gap.seeds,
                 "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
-                "minutes": search_minutes(out / name, gap),
+                "minutes": _search_minutes(out / name, gap),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
                 "ceiling": _ceiling(out / name, gap),
             }
             for name, gap in gaps.items()
         },
-        "expected_minutes": {row["part"]: round(row["minutes"], 1) for row in expected},
         "summary": json.loads(summary.to_json(orient="records")),
     }
     write_record(folder / RESULT_FILE, record)
@@ -91,7 +87,7 @@ def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
     return (design.baselines or {}).get("continuous phase")
 
 
-def search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
+def _search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
     """Minutes of search per arm, over the judged seeds, as the designs recorded them."""
 
     def minutes(arm: str) -> float:

@@ -59,11 +59,6 @@ def design_command(*words: object) -> tuple[str, ...]:
     return command("litho-design", *words)
 
 
-def module_command(*words: object) -> tuple[str, ...]:
-    """This benchmark itself as a command."""
-    return (sys.executable, "-m", "benchmarks.gap", *map(str, words))
-
-
 def _run(step: tuple[Job, Path]) -> float | None:
     """Seconds that the command took; None where it failed."""
     (job, log), started = step, time.monotonic()

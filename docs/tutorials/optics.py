@@ -54,5 +54,5 @@ figure
 print(litho_design.export("with", "png16", "to-printer").name)
 
 # %% [markdown]
-# Next: [what the scores mean, lenses, process windows](../optics.md), [comparing models as
+# Next: [lenses, process windows](../optics.md), [what the scores mean](../scores.md), [comparing models as
 # designers](../gap.md).

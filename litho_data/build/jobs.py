@@ -58,6 +58,10 @@ def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
     return piece.record
 
 
+# A field that is alone on the substrate gets a rim of level 0: models go on as a layout ends.
+_BARE_PX = 2
+
+
 @dataclass(frozen=True)
 class FieldJob:
     """Read, level, register and resample one printed field.
@@ -200,6 +204,10 @@ class FieldJob:
         params: dict[str, Any] = {"levels": self.card.layout.levels}
         if self.card.layout.grey_per_level is not None:
             params["grey_per_level"] = self.card.layout.grey_per_level
+        write = self.card.write
+        surround = self.field.columns.get("surround") or (write.surround if write else None)
+        if surround == "substrate":
+            params["bare_px"] = _BARE_PX
         return OPERATIONS["read-layout"].run(params, file, {})
 
     @property

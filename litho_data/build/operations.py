@@ -62,7 +62,7 @@ def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     if level.max() >= params["levels"]:
         wanted = f"at most {params['levels'] - 1}, since the card says levels = {params['levels']}"
         raise InputError(f"layout {files[0]}: highest level", got=int(level.max()), wanted=wanted)
-    return {"mask_level": level}, {}
+    return {"mask_level": np.pad(level, params.get("bare_px", 0))}, {}
 
 
 @_operation("read-scan", "", "readers", "scan.py", "foundation/units.py")

@@ -1,10 +1,12 @@
 """What the three command lines share: their settings, exit codes, and errors of one line."""
 
 import errno
+import functools
+import inspect
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 from typing import Annotated, Any
 
@@ -53,6 +55,38 @@ _WAYS_OUT = {
 }
 
 
+def _show_all(context: typer.Context, asked: bool) -> None:
+    if asked and not context.resilient_parsing:
+        for parameter in context.command.params:
+            if hasattr(parameter, "hidden"):
+                parameter.hidden = False
+        typer.echo(context.get_help())
+        raise typer.Exit()
+
+
+HelpAll = Annotated[
+    bool, typer.Option("--help-all", help="Show the other options too.", is_eager=True, callback=_show_all)
+]
+
+
+def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that hides some of its options ``--help-all``, which shows them."""
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        values.pop("help_all")
+        command(**values)
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    shown = [*own, inspect.Parameter("help_all", kind, default=False, annotation=HelpAll)]
+    shown = [one.replace(kind=kind) for one in shown]
+    # Typer reads both.
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in shown}
+    return run
+
+
 def new_app(help_text: str) -> typer.Typer:
     """A typer application with the settings of this project."""
 
@@ -71,7 +105,12 @@ def new_app(help_text: str) -> typer.Typer:
 
     # Without invoke_without_command, --version alone would be asked for a command.
     return typer.Typer(
-        help=help_text, callback=options, invoke_without_command=True, pretty_exceptions_enable=False
+        help=help_text,
+        callback=options,
+        invoke_without_command=True,
+        pretty_exceptions_enable=False,
+        # Boxes leave a third of a line of 80 characters to what an option does.
+        rich_markup_mode=None,
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from litho_data.foundation.app import new_app, run_app
+from litho_data.foundation.app import new_app, run_app, with_further_options
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import changed
 from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
@@ -39,6 +39,7 @@ app.command()(settings)
 
 
 @app.command()
+@with_further_options
 def score(
     design: Annotated[Path, typer.Argument(help="folder of a design")],
     out: Out,
@@ -52,11 +53,12 @@ def score(
     scan_levelling: ScanLevelling = "bow",
     scan_aligned: ScanAligned = False,
     scan_scale_sd: Annotated[
-        float, typer.Option(help="relative standard uncertainty of the microscope's height scale")
+        float,
+        typer.Option(help="relative standard uncertainty of the microscope's height scale", hidden=True),
     ] = 0.02,
     scan_tip_um: Annotated[
         float | None,
-        typer.Option(help="radius of the tip, µm; 0 for none. By default what the scan tells"),
+        typer.Option(help="radius of the tip, µm; 0 for none. By default what the scan tells", hidden=True),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -64,7 +66,8 @@ def score(
     ] = None,
     camera_pitch_um: Annotated[float | None, typer.Option(help="its pixel in the image plane, µm")] = None,
     camera_pitch_sd: Annotated[
-        float, typer.Option(help="relative uncertainty of that, where the magnification is not sure")
+        float,
+        typer.Option(help="relative uncertainty of that, where the magnification is not sure", hidden=True),
     ] = 0.0,
     camera_flat: Annotated[
         Path | None,
@@ -96,14 +99,23 @@ def score(
         ),
     ] = None,
     stitch_field_um: Annotated[
-        float, typer.Option(help="side of the write fields that the judges' prints are made of, µm", min=1e-6)
+        float,
+        typer.Option(
+            help="side of the write fields that the judges' prints are made of, µm", min=1e-6, hidden=True
+        ),
     ] = 100.0,
     stitch_sigma_um: Annotated[
-        float, typer.Option(help="sd along each axis by which each of them lies off its place, µm", min=0)
+        float,
+        typer.Option(
+            help="sd along each axis by which each of them lies off its place, µm", min=0, hidden=True
+        ),
     ] = 0.0,
     task_file: Annotated[
         Path | None,
-        typer.Option(help="file in Python that registers the task of the design, one of your own; it is run"),
+        typer.Option(
+            help="file in Python that registers the task of the design, one of your own; it is run",
+            hidden=True,
+        ),
     ] = None,
     stream: Annotated[
         bool,

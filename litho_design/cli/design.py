@@ -51,15 +51,19 @@ SpreadOf = Annotated[
     Path | None,
     typer.Option(
         help="dataset store: take the spread of gain and offset from its measured prints, the locked "
-        "scans left out"
+        "scans left out",
+        hidden=True,
     ),
 ]
 RoughnessOf = Annotated[
     Path | None,
-    typer.Option(help="noise.json of litho-models noise: the surface of a print is as rough as measured"),
+    typer.Option(
+        help="noise.json of litho-models noise: the surface of a print is as rough as measured", hidden=True
+    ),
 ]
 Ensemble = Annotated[
-    list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; repeatable")
+    list[str] | None,
+    typer.Option(help="NAME=MODEL of a further model in the loss; repeatable", hidden=True),
 ]
 Judges = Annotated[
     list[str] | None,
@@ -75,13 +79,16 @@ Robust = Annotated[
 Objects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: picture, or folder of pictures, to image instead of the drawings; "
-        "repeatable. Without --held-out-objects the last quarter by name, two at least, is held out"
+        help="computational lens: picture or folder of pictures to image instead of the drawings; repeatable"
     ),
 ]
 HeldOutObjects = Annotated[
     list[Path] | None,
-    typer.Option(help="computational lens: picture or folder of pictures that is only scored; repeatable"),
+    typer.Option(
+        help="computational lens: picture or folder of pictures that is only scored; repeatable. By default "
+        "the last quarter of --objects by name, two at least",
+        hidden=True,
+    ),
 ]
 
 
@@ -131,6 +138,7 @@ def hoe(
             "--large",
             help="in bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
             "shares them among processes",
+            hidden=True,
         ),
     ] = False,
     band_px: BandPx = 512,

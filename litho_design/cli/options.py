@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 import typer
 from pydantic import BaseModel
 
+from litho_data.foundation.app import with_further_options
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
@@ -26,26 +27,31 @@ Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
 Extrapolate = Annotated[
     bool,
     typer.Option(
-        "--extrapolate", help="accept heights beyond the model's calibration; recorded in the result"
+        "--extrapolate",
+        help="accept heights beyond the model's calibration; recorded in the result",
+        hidden=True,
     ),
 ]
 BandPx = Annotated[
     int,
     typer.Option(
-        help="rows of a band at most, px: with --large or --stream memory grows with its square", min=8
+        help="rows of a band at most, px: with --large or --stream memory grows with its square",
+        min=8,
+        hidden=True,
     ),
 ]
 Scan = Annotated[Path | None, typer.Option(help="AFM height map of the printed part")]
-ScanUnit = Annotated[str | None, typer.Option(help="unit of its heights, if the file has none")]
-ScanSizeUm = Annotated[float | None, typer.Option(help="its side, µm, if the file has none")]
+ScanUnit = Annotated[str | None, typer.Option(help="unit of its heights, if the file has none", hidden=True)]
+ScanSizeUm = Annotated[float | None, typer.Option(help="its side, µm, if the file has none", hidden=True)]
 ScanLevelling = Annotated[
     Literal["none", "plane", "bow"],
-    typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order"),
+    typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order", hidden=True),
 ]
 ScanAligned = Annotated[
     bool,
     typer.Option(
         "--scan-aligned",
+        hidden=True,
         help="it lies on the pixels of the element, upright: for one that looks alike in several places",
     ),
 ]
@@ -122,6 +128,13 @@ class Given:
         return flattened(preset, content, f"setting of {self.config}") | flattened(preset, self.options)
 
 
+# The settings whose options a command shows first; the others are behind --help-all.
+_FIRST = {
+    *("variant", "task", "layout.size_px", "layout.cell_um", "optics.wavelength_um", "optics.distance_um"),
+    *("search.iterations", "search.seed", "height_um"),
+}
+
+
 def takes_settings(
     *presets: BaseModel, leave_out: Collection[str] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -161,7 +174,7 @@ def takes_settings(
         # Typer reads both.
         run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
-        return run
+        return with_further_options(run)
 
     return decorate
 
@@ -202,6 +215,7 @@ def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Paramet
         help=described[:1].lower() + described[1:],
         show_default=" or ".join(values),
         rich_help_panel=leaf.group or None,
+        hidden=leaf.path not in _FIRST,
     )
     return _keyword(name, Annotated[leaf.kind | None, option])
 

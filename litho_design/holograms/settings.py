@@ -46,8 +46,8 @@ def hologram_settings(
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
     temperature 1, a tenth of the rate after more than ten iterations without progress, wavelength 0.633
     and index step 0.545; its efficiency term is constant and therefore left out). What is not reproduced
-    of that code is in docs/optics.md. ``default``: one height per cell from a Gerchberg-Saxton start, and
-    a polish of the printable layout.
+    of that code is in docs/from_the_authors_code.md. ``default``: one height per cell from a Gerchberg-Saxton
+    start, and a polish of the printable layout.
 
     Args:
         variant: the preset; ``variant`` among the changes replaces it.

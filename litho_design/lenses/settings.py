@@ -116,8 +116,8 @@ def lens_settings(
     ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings
     as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25,
     smooth L1, read and photon noise, their wavelength and index step, objects as wide as the lens. What
-    is not reproduced of the published code is in docs/optics.md. ``default``: a circular aperture, the
-    Fresnel phase as start, and the ring path in the search.
+    is not reproduced of the published code is in docs/from_the_authors_code.md. ``default``: a circular
+    aperture, the Fresnel phase as start, and the ring path in the search.
 
     Args:
         task: focus light, or image and deconvolve; ``task`` among the changes replaces it.

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
+from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import assigned
 from litho_data.foundation.units import NM_PER_UM
@@ -32,12 +32,13 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
     typer.Option(help="terms fitted to each scan for its datum-free error"),
 ]
-BackgroundOption = Annotated[
-    Literal["training", "none"],
-    typer.Option(
-        help="training: add the smooth background that the training scans share to predictions of measured "
-        "maps; both errors are in the tables"
-    ),
+_BACKGROUND_HELP = (
+    "training: add the smooth background that the training scans share to predictions of measured maps"
+)
+BackgroundOption = Annotated[Literal["training", "none"], typer.Option(help=_BACKGROUND_HELP)]
+SharedOption = Annotated[
+    Literal["training", "shared", "none"],
+    typer.Option(help=f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -58,12 +59,13 @@ VariantOption = Annotated[
 Steps = Annotated[int | None, typer.Option(min=1, help="optimiser steps; the recipe's by default")]
 PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
-    typer.Option(help="of the products within networks in training; the recipe's by default"),
+    typer.Option(help="of the products within networks in training; the recipe's by default", hidden=True),
 ]
 WeightsOption = Annotated[
     Literal["uniform", "sigma"],
     typer.Option(
-        help="what pixels count for in fits: alike, or by 1 / σ of the height; errors count all alike"
+        help="what pixels count for in fits: alike, or by 1 / σ of the height; errors count all alike",
+        hidden=True,
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
@@ -71,12 +73,13 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="FIELD=VALUE of the training that has no option, such as learning_rate=0.001; repeatable",
+        help="FIELD=VALUE of the training, such as learning_rate=0.001; repeatable",
     ),
 ]
 
 
 @app.command()
+@with_further_options
 def train(
     store: StorePath,
     model: Annotated[
@@ -161,6 +164,7 @@ def evaluate(
 
 
 @app.command()
+@with_further_options
 def benchmark(
     store: StorePath,
     out: Out,
@@ -175,10 +179,11 @@ def benchmark(
     weights: WeightsOption = "uniform",
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
     first_folds: Annotated[
-        int | None, typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default")
+        int | None,
+        typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default", hidden=True),
     ] = None,
     policy: PolicyOption = "offset",
-    background: BackgroundOption = "training",
+    background: SharedOption = "training",
     noise: NoiseOption = None,
     open_lock_box: Annotated[
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
@@ -186,7 +191,7 @@ def benchmark(
     seed: Seed = 0,
     training_seed: Annotated[
         int | None,
-        typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
+        typer.Option(min=0, help="of weights and crops alone, same split; --seed by default", hidden=True),
     ] = None,
     set_: SetOption = None,
     workers: WorkersOption = 1,

@@ -23,7 +23,7 @@ from litho_data.foundation.workers import Workers, run_jobs
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
+from litho_models.evaluation.fit_cache import FitRecord, expected, fit_or_load
 from litho_models.evaluation.reports import write_benchmark_report
 from litho_models.evaluation.results import Benchmark
 from litho_models.fitting import TrainingConfig
@@ -71,7 +71,8 @@ def benchmark(
         folds: number of folds of ``grouped``, at most the number of development scans.
         first_folds: fit and score only so many of the folds, to compare seeds or settings; None for all.
         policy: nuisances of ``mae_datum_free_nm``.
-        background: whether each fit's background, learned on its training scans, is added to its predictions.
+        background: ``training``: each fit's smooth background, learned on its training scans, is added to
+            its predictions; ``shared``: they go through the measurement model, learned there with the fit.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
@@ -106,7 +107,9 @@ def benchmark(
     known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
     places = Workers(workers, dask, known)
     jobs: list[_Job] = [
-        (name, fold, configs[name], Path(out) / CACHE_FOLDER) for name in models for fold in plan
+        (name, fold, configs[name], Path(out) / CACHE_FOLDER, background == "shared")
+        for name in models
+        for fold in plan
     ]
     done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
     started = time.monotonic()
@@ -120,10 +123,8 @@ def benchmark(
             say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
         started = time.monotonic()
         fits[name, fold.number] = record
-        assert record.diagnostics is not None
-        learned = record.diagnostics.background if background == "training" else None
         predicted.setdefault((name, fold.locked), {}).update(
-            (scan.id, Prediction.beside(learned, height))
+            (scan.id, expected(record, background, scan, height))
             for scan, height in zip(fold.held_out, heights, strict=True)
         )
     protocol = NuisanceProtocol.of_policy(policy, seed, background)
@@ -165,7 +166,7 @@ def benchmark(
     return result
 
 
-_Job = tuple[str, Fold, TrainingConfig, Path]
+_Job = tuple[str, Fold, TrainingConfig, Path, bool]
 
 
 def _fit(job: _Job) -> tuple[FitRecord, list[np.ndarray]]:

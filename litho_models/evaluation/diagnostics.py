@@ -12,6 +12,7 @@ from litho_data.store import PrintedScan
 from litho_models.prediction.cost import PredictionCost, measured_predictions
 from litho_models.prediction.tiles import predict_scan, tile_difference
 from litho_models.scan_terms.background import Background, learn_background
+from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 from litho_models.scoring.metrics import score_scan
 from litho_models.simulator import Simulator
 
@@ -29,9 +30,11 @@ class FitDiagnostics(Record):
 
     The three errors are comparable, which shows over-fitting: the mean over scans of the datum-free error of
     policy ``offset``, without a background. ``inner_validation_nm`` is None for fits without it.
+    ``measurement``: learned with the model, for fits that were freed of it.
     """
 
     background: Background
+    measurement: MeasurementModel | None = None
     training_nm: float
     inner_validation_nm: float | None
     held_out_nm: float
@@ -45,12 +48,14 @@ def diagnose(
     validation_ids: Sequence[str],
     held_out: Sequence[PrintedScan],
     held_out_um: Sequence[np.ndarray],
+    measured: bool = False,
 ) -> FitDiagnostics:
     """Examine a fitted model.
 
     Args:
         model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
         held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
+        measured: also learn the measurement model beside it.
     """
     heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
     seen = {scan.id: height for scan, height in zip(scans, heights, strict=True)}
@@ -58,6 +63,7 @@ def diagnose(
     chosen_by = [scan for scan in scans if scan.id in validation_ids]
     return FitDiagnostics(
         background=learn_background(scans, heights),
+        measurement=learn_measurement(scans, heights) if measured else None,
         training_nm=_error_nm([scan for scan in scans if scan.id not in validation_ids], seen),
         inner_validation_nm=_error_nm(chosen_by, seen) if chosen_by else None,
         held_out_nm=_error_nm(held_out, unseen),

@@ -5,19 +5,26 @@ Each (model, fold) is a folder of its own, named by the hash of everything that 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.results import Record
+from litho_data.store import PrintedScan
 from litho_models.evaluation.diagnostics import FitDiagnostics, diagnose
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.models import build_model
 from litho_models.prediction.tiles import predict_scan
+from litho_models.scan_terms import BackgroundUse
+from litho_models.scan_terms.measurement import learn_measurement
+from litho_models.scoring.records import Prediction
+from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 _FIT, _DIAGNOSTICS, _PREDICTION = "fit.json", "diagnostics.json", "prediction_{:03d}.npy"
@@ -46,29 +53,55 @@ class FitRecord(Record):
 
 
 def fit_or_load(
-    name: str, fold: Fold, config: TrainingConfig, cache: Path
+    name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
 ) -> tuple[FitRecord, list[np.ndarray]]:
     """One fit and its heights (ny, nx) of the held-out scans, µm; made only if the cache has none.
+
+    Args:
+        measured: fit once more to the training scans freed of what the measurement model learns beside the
+            first fit, and learn it again beside the second.
 
     Raises:
         InputError: a kept fit that cannot be read.
     """
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
+    key = record_sha256({"fit": key, "background": "shared"}) if measured else key
     folder = fit_folder(cache, name, key)
     if not ((folder / _FIT).exists() and (folder / _DIAGNOSTICS).exists()):
         # A finished training is read from its checkpoint; a small model is fitted again.
         fitted = fit_in_cache(name, fold.training, config, cache)
+        if measured:
+            fitted = fit_in_cache(name, _freed(fitted.model, fold.training), config, cache)
         if not (folder / _FIT).exists():
             _keep_fit(folder, fitted, fold, key)
         _, heights = kept_fit(folder)
-        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights)
+        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured)
         with atomic_file(folder / _DIAGNOSTICS) as temporary:
             temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
     record, heights = kept_fit(folder)
     with reading_kept(folder):
         diagnostics = FitDiagnostics.model_validate_json((folder / _DIAGNOSTICS).read_bytes())
     return record.model_copy(update={"diagnostics": diagnostics}), heights
+
+
+def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
+    """Training scans without what they share beside their prints, as the model predicts those."""
+    heights = [predict_scan(model, scan) for scan in scans]
+    learned = learn_measurement(scans, heights)
+    return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
+
+
+def expected(
+    record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
+) -> Prediction:
+    """What a fit expects of a scan: its height (ny, nx), µm, and what its training scans add to theirs."""
+    found = record.diagnostics
+    if background == "none" or found is None:
+        return Prediction(height_um)
+    if background == "shared" and found.measurement is not None:
+        return Prediction.seen(found.measurement, scan, height_um)
+    return Prediction.beside(found.background, height_um)
 
 
 def fit_folder(cache: Path, name: str, key: str) -> Path:

@@ -150,6 +150,10 @@ def protocol_text(protocol: NuisanceProtocol) -> str:
 
 
 _BACKGROUND_TEXT = {
+    "shared": "Background 'shared': predictions go through the measurement model (levelling, background, "
+    "displacements, gain; shared by all training scans or a group of them), learned on the training scans "
+    "with the printer; nothing of it is fitted to the scored scan. The table of policies has the errors "
+    "of the print alone too.",
     "none": "Background 'none': predictions are those of the print alone.",
     "training": "Background 'training': to each prediction is added what the training scans have in common "
     "beside their prints (five smooth terms, nothing fitted to the scored scan); the table of policies has "

@@ -152,7 +152,7 @@ def _dose(page: Page, found: DoseMatrix) -> None:
 def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.heading(f"Uncertainty of {found.model}")
     origin = "no fit has seen" if found.held_out else "the model was trained on, so they are too small"
-    shared = "with" if found.nuisance.background == "training" else "without"
+    shared = "without" if found.nuisance.background == "none" else "with"
     background = f"{shared} the background that the training scans share"
     page.paragraph(
         f"Errors on scans that {origin}, with {_FREE[found.nuisance.policy]}, {background}: RMS "

@@ -97,6 +97,7 @@ def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
 def _of_benchmarks(
     store: Store, folders: Sequence[Path], model: str | None
 ) -> tuple[str, Predictions, NuisanceProtocol]:
+    from litho_models.evaluation.fit_cache import expected
     from litho_models.evaluation.results import Benchmark
 
     members: Predictions = {}
@@ -115,12 +116,11 @@ def _of_benchmarks(
         require_known(f"model of {folder}", chosen, names)
         allowed = set(result.split.scored_ids) & set(store.ids)
         protocols.append(result.nuisance)
-        with_background = result.nuisance.background == "training"
         for fit in (entry for entry in result.fits if entry.model == chosen):
-            learned = fit.diagnostics.background if with_background and fit.diagnostics else None
             for scan_id, height_um in _cached(folder, fit.model, fit.key).items():
                 if scan_id in allowed:
-                    members.setdefault(scan_id, []).append(Prediction.beside(learned, height_um).map_um)
+                    seen = expected(fit, result.nuisance.background, store.scan(scan_id), height_um)
+                    members.setdefault(scan_id, []).append(seen.map_um)
     policies = sorted({protocol.policy for protocol in protocols})
     if len(policies) > 1:
         raise InputError("nuisance policies of the benchmarks", got=", ".join(policies), wanted="one")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 
-from litho_models.loop.result.questions import OpenQuestions, Question
 from litho_models.planning import power
+from litho_models.planning.questions import OpenQuestions, Question
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
 
@@ -25,67 +27,57 @@ def of_rivals(
     prints: int,
 ) -> PlannedQuestion:
     """A question whose rivals are models: judged on the planned prints, and on as many random layouts."""
-    question, spread = rivalry.question, rivalry.question.spread
+    question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
     names = [rival.name for rival in question.rivals]
-    status = _status(hardest.power, prints)
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
-    return PlannedQuestion(
-        name=question.name,
-        kind=question.kind,
-        text=question.text,
-        status=status,
-        why=f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"
-        + (f"; what a print says varies by {100 * spread:.0f} %, beyond noise" if spread else "")
-        + _of_form(hardest.difference_nm, question.form_nm, status)
-        + (f". Not in this plan: {question.experiment}" if status == _HOPELESS else ""),
+    why = [f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"]
+    if question.spread:
+        why.append(f"what a print says varies by {100 * question.spread:.0f} %, beyond noise")
+    if question.form_nm is not None:
+        why.append(
+            f"the model's own error is {question.form_nm:.1f} nm at most, the two differ by "
+            f"{hardest.difference_nm:.1f} nm"
+        )
+    if _status(hardest.power, prints) == _HOPELESS:
+        why.append(f"no experiment of this plan separates them; not in it: {question.experiment}")
+    return _planned(
+        question,
+        hardest.power,
+        prints,
+        "; ".join(why),
+        [
+            *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
+            "two are as near: these two stay a set, the others are excluded",
+            "all leave more than the noise: none of them is the cause",
+        ],
         rivals=names,
         pairs=pairs,
         difference_nm=hardest.difference_nm,
         random_difference_nm=min(pair.difference_nm for pair in control),
         noise_nm=hardest.noise_nm,
-        form_nm=question.form_nm,
-        power=hardest.power,
         random_power=np.min([pair.power for pair in control], axis=0).tolist(),
-        prints_needed=power.prints_needed(hardest.power),
-        outcomes=[
-            *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
-            "two are as near: these two stay a set, the others are excluded",
-            "all leave more than the noise: none of them is the cause",
-        ],
     )
-
-
-def _of_form(difference_nm: float, form_nm: float | None, status: Status) -> str:
-    """The difference beside the error of the model's own form."""
-    if form_nm is None:
-        return ""
-    told = f"the model's own error is {form_nm:.1f} nm at most, the two differ by {difference_nm:.1f} nm"
-    return f"; {'no experiment of this plan separates them: ' if status == _HOPELESS else ''}{told}"
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
     """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
-    names = [rival.name for rival in rivalry.question.rivals]
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     drawn = [rivalry.drawn(random) for _ in range(DRAWS)]
     contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
+    fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2))
     directed = {}
-    for pair, fitted, *others in zip(rivalry.pairs, rivalry.contrasts(prints), *contrasts, strict=True):
+    for pair, contrast, *others in zip(rivalry.pairs, fitted, *contrasts, strict=True):
         powers = [[power.of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in others]
-        directed[pair] = fitted, np.mean(powers, axis=0).tolist()
+        directed[pair] = np.mean(powers, axis=0).tolist(), contrast
     found = []
-    for first, second in (pair for pair in directed if pair[0] < pair[1]):
-        contrast, mean = min(
-            (directed[first, second], directed[second, first]), key=lambda one: tuple(one[1])
-        )
+    for pair in combinations(range(len(rivalry.twins)), 2):
+        mean, contrast = min((directed[pair], directed[pair[::-1]]), key=lambda one: one[0])
+        one, other = (rivalry.question.rivals[at].name for at in pair)
         found.append(
             PlannedPair(
-                rivals=(names[first], names[second]),
-                difference_nm=contrast.rms_nm,
-                noise_nm=contrast.noise_nm,
-                power=mean,
+                rivals=(one, other), difference_nm=contrast.rms_nm, noise_nm=contrast.noise_nm, power=mean
             )
         )
     return found
@@ -95,60 +87,44 @@ def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
     """A question whose answer lies in how prints are scanned, not in what is printed."""
-    difference = noise = None
-    if question.kind == "generic" and question.turning is not None:
-        turning = question.turning
-        difference, noise = turning.rms_nm, turning.noise_nm
-        # Only the first print is scanned once more at the end.
-        shown = [n if turning.by == "turned scan" else 1 for n in _COUNTS]
-        powers = [power.of_generic(question, n) for n in shown]
-        why = f"{turning.by}: as the printer's and as the microscope's it differs by {difference:.1f} nm rms"
-        why += _of_form(difference, question.form_nm, _status(powers, prints))
-        if difference < 0.1:
-            why += "; turning a print does not show it: a second tip and a step standard do"
-        outcomes = [
-            "the term stays where it was on the print: the printer's, or the resist's",
-            "it goes with the scan: the microscope's, and no design may use it",
-        ]
-    elif question.kind == "lines":
+    if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
-        difference = 1e3 * sd_um
-        powers = [power.of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS]
-        why = "lines of a turned scan run along the other axis of the layout than written ones"
-        outcomes = [
-            "offsets follow the layout's rows in turned scans, too: written",
-            "they follow the scan lines: scanned",
-        ]
-    elif question.kind == "per-scan":
-        powers = [power.of_repeats(n, scans) for n in _COUNTS]
-        why = "every print is taken out and scanned again: what belongs to it comes back"
-        outcomes = [
-            "scans of one print agree: the printer's, different in every print",
-            "they agree no better than scans of different prints: the microscope's",
-        ]
-    else:
-        powers, outcomes = (
-            [0.0 for _ in _COUNTS],
-            [f"once the fact is in the card, {question.name} is tested"],
+        return _planned(
+            question,
+            [power.of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS],
+            prints,
+            "lines of a turned scan run along the other axis of the layout than written ones",
+            [
+                "offsets follow the layout's rows in turned scans, too: written",
+                "they follow the scan lines: scanned",
+            ],
         )
-        why = question.experiment
-    status: Status = "needs a fact" if question.kind == "fact" else _status(powers, prints)
+    if question.kind == "per-scan":
+        return _planned(
+            question,
+            [power.of_repeats(n, scans) for n in _COUNTS],
+            prints,
+            "every print is taken out and scanned again: what belongs to it comes back",
+            [
+                "scans of one print agree: the printer's, different in every print",
+                "they agree no better than scans of different prints: the microscope's",
+            ],
+        )
+    told = [f"once the fact is in the card, {question.name} is tested"]
+    return _planned(question, [0.0 for _ in _COUNTS], prints, question.experiment, told)
+
+
+def _planned(
+    question: Question, powers: list[float], prints: int, why: str, outcomes: list[str], **known: Any
+) -> PlannedQuestion:
     return PlannedQuestion(
-        name=question.name,
-        kind=question.kind,
-        text=question.text,
-        status=status,
+        **question.model_dump(include={"name", "kind", "text", "form_nm"}),
+        status="needs a fact" if question.kind == "fact" else _status(powers, prints),
         why=why,
-        rivals=[],
-        pairs=[],
-        difference_nm=difference,
-        random_difference_nm=difference,
-        noise_nm=noise,
-        form_nm=question.form_nm,
         power=powers,
-        random_power=powers,
         prints_needed=power.prints_needed(powers),
         outcomes=outcomes,
+        **{"random_power": powers, **known},
     )
 
 

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import shutil
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
-from litho_data.foundation.hashes import record_sha256
-from litho_data.layouts.random_layout import random_layout
+from litho_data.foundation.files import atomic_file
 from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
-from litho_models.loop.result.questions import OpenQuestions, Question
-from litho_models.planning.answers import DRAWS
-from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score, starts
-from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
+from litho_models.planning.layouts import Limits, climb, score, starts
+from litho_models.planning.rivalry import Place, Rivalry, Way
 
 TURNED = Way(turned_deg=90)
-_EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True), Way(fine=True))
+WORDS = {
+    TURNED: "turned by 90°",
+    Way(direction=-1): "in the other direction",
+    Way(tip=2): "with a new, sharp tip",
+    Way(pixel_size=0.5): "with pixels of half the size, as much time for each",
+}
 _MOST_EXTRAS = 2
 # A further scan is worth its time if it brings rivals apart by this factor.
 _WORTH = 1.3
@@ -30,29 +29,20 @@ _WORTH = 1.3
 SECOND_DOSE = 0.8
 # Below this many standard deviations a layout shows nothing of the difference.
 _NOTHING = 0.3
-WORDS = {
-    TURNED: "turned by 90°: what lies along the scan lines turns with them, what lies along the written "
-    "lines does not",
-    Way(backward=True): "in the other direction: what lags behind changes sides",
-    Way(
-        new_tip=True
-    ): "with a new, sharp tip: what the tip adds is gone, what was printed stays; turning the "
-    "print shows nothing of a round tip",
-    Way(fine=True): "with pixels of half the size, as much time for each: what the microscope blurs or "
-    "delays is half as long, what was printed stays",
-}
+# Registration refuses layouts that repeat themselves by more than 0.9; a print shows them less clearly.
+_MOST_REPEATING = 0.7
 
 
 class Chosen(NamedTuple):
-    """How the prints of a question are made and scanned.
+    """How prints are made and scanned, for one question or for all.
 
-    ``ways``: scans of each; ``place``: in the write field; ``second_dose``: whether every other print gets
-    less dose; ``tried``: separation in standard deviations by one scan, and by each way beside it.
+    ``ways``: scans of each; ``places`` in the write field and ``doses``: of the prints in turn; ``tried``:
+    separation in standard deviations by one scan, and by each way beside it.
     """
 
     ways: tuple[Way, ...]
-    place: Place
-    second_dose: bool
+    places: tuple[Place, ...]
+    doses: tuple[float, ...]
     tried: dict[str, float]
 
 
@@ -60,188 +50,79 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     """What brings the rivals of a question apart.
 
     Args:
-        rivalry: the rivals.
-        level: a layout to try the ways on.
-        can_move: whether the write field is larger than a print and known.
+        level: a layout to try the ways on; ``can_move``: whether the write field is larger than a print.
     """
     ways: tuple[Way, ...] = (Way(),)
     reached = score(rivalry, level, ways)
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
-        scores = {}
-        for extra in _EXTRAS:
-            if extra not in ways:
-                scores[extra] = score(rivalry, level, (*ways, extra))
-                # What each does beside one plain scan; later ones only add to it.
-                tried.setdefault(f"a scan {WORDS[extra].split(':')[0]}", scores[extra])
+        scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
+        # What each does beside one plain scan; later ones only add to it.
+        tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
-        if scores[best] < max(_WORTH * reached, _NOTHING):
+        if not _worth(scores[best], reached):
             break
         ways, reached = (*ways, best), scores[best]
-    place: Place = "centre"
+    places: tuple[Place, ...] = ("centre",)
     if can_move:
-        at_edge = score(rivalry, level, ways, "edge")
-        tried["at the edge of the write field"] = at_edge
-        if at_edge >= max(_WORTH * reached, _NOTHING):
-            place = "edge"
-    at_one, at_two = (score(rivalry, level, ways, place, (1.0, dose)) for dose in (1.0, SECOND_DOSE))
-    tried |= {"two prints so scanned": at_one, f"the second of them at {SECOND_DOSE:g} of the dose": at_two}
-    return Chosen(ways, place, at_two >= max(_WORTH * at_one, _NOTHING), tried)
+        tried["at the edge of the write field"] = at_edge = score(rivalry, level, ways, "edge")
+        places = ("edge", "centre") if _worth(at_edge, reached) else places
+    one, two = (score(rivalry, level, ways, places[0], (1.0, dose)) for dose in (1.0, SECOND_DOSE))
+    tried |= {"two prints so scanned": one, f"the second of them at {SECOND_DOSE:g} of the dose": two}
+    return Chosen(ways, places, (1.0, SECOND_DOSE) if _worth(two, one) else (1.0,), tried)
 
 
-def ways_without_rivals(questions: Sequence[Question]) -> tuple[Way, ...]:
-    """Scans asked for by questions whose answer depends on no layout."""
-    turned = any(
-        q.kind == "lines" or (q.turning is not None and q.turning.by == "turned scan") for q in questions
-    )
-    repeated = any(q.kind == "per-scan" for q in questions)
-    # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
-    return (TURNED,) if turned or repeated else ()
+def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
+    """What any of the questions needs; ``asked``: ways that no layout is needed for."""
+    ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
+    places = max((one.places for one in choices), key=len, default=("centre",))
+    return Chosen(tuple(ways), places, max((one.doses for one in choices), key=len, default=(1.0,)), {})
 
 
-_TILES = 4
-# Registration refuses layouts that repeat themselves by more than 0.9; a print shows them less clearly.
-_MOST_REPEATING = 0.7
+def _worth(more: float, reached: float) -> bool:
+    return more >= max(_WORTH * reached, _NOTHING)
 
 
-class Designer:
-    """Ways to scan, and tiles that climbed, for the questions that have rivals."""
+def climbed(
+    rivalries: Sequence[Rivalry],
+    chosen: Chosen,
+    limits: Limits,
+    tile_px: int,
+    count: int,
+    *,
+    seed: int,
+    steps: int,
+    kept: Path,
+    report: Callable[[str], None],
+) -> tuple[list[np.ndarray], list[str]]:
+    """Tiles that climbed for the questions in turn, soft levels, and where each began.
 
-    def __init__(
-        self,
-        rivalries: Sequence[Rivalry],
-        limits: Limits,
-        size_px: int,
-        seed: int,
-        steps: int,
-        cache: Path,
-        report: Callable[[str], None],
-    ):
-        self.rivalries, self.limits, self.seed, self.steps = rivalries, limits, seed, steps
-        self.size_px, self.tile_px = size_px, min(TILE_PX, size_px)
-        self.cache, self.report = cache, report
-        self.ways: tuple[Way, ...] = (Way(),)
-        self.tried: list[dict[str, float]] = []
-        self.chosen: list[str] = []
-        self._edge = self._second_dose = False
-
-    def choose(self, asked: Sequence[Way], can_move: bool) -> None:
-        """Settle how every print is scanned: what any of the questions needs."""
-        ways = [Way(), *asked]
-        for rivalry in self.rivalries:
-            found = choose(rivalry, random_level(self.limits, self.tile_px, self.seed), can_move)
-            ways += found.ways
-            self._edge |= found.place == "edge"
-            self._second_dose |= found.second_dose
-            self.tried.append(found.tried)
-        self.ways = tuple(dict.fromkeys(ways))
-
-    def place(self, number: int) -> Place:
-        """Where a print lies in the write field: in turn at edge and centre, if that shows anything."""
-        return "edge" if self._edge and number % 2 == 0 else "centre"
-
-    def dose(self, number: int) -> float:
-        """Of a print, relative: every other one gets less, if that shows anything."""
-        return SECOND_DOSE if self._second_dose and number % 2 else 1.0
-
-    def tiles(self, loop: Path, prints: int) -> list[np.ndarray]:
-        """The tiles of all prints, soft levels; those of an interrupted run are taken as they are."""
-        count = self._count(prints)
-        if not self.rivalries:
-            return self.random_tiles(prints)
-        questions = (loop / OpenQuestions.FILE_NAME).read_text(encoding="utf-8")
-        key = record_sha256(
-            {
-                "questions": questions,
-                "ways": [vars(way) for way in self.ways],
-                "settings": [self.tile_px, self.seed, self.steps, count],
-            }
-        )[:16]
-        kept = self.cache / key
-        kept.mkdir(parents=True, exist_ok=True)
-        self._announce(count, sum((kept / f"{n}.npy").is_file() for n in range(count)))
-        ranked = [self._ranked(rivalry) for rivalry in self.rivalries]
-        tiles = []
-        for number in range(count):
-            which, rank = number % len(self.rivalries), number // len(self.rivalries)
-            name, start = ranked[which][rank % len(ranked[which])]
-            file = kept / f"{number}.npy"
-            if not file.is_file():
-                self.report(
-                    f"tile {number + 1} of {count}: from {name}, for {self.rivalries[which].question.name}"
-                )
-                place: Place = "edge" if self._edge else "centre"
-                tile = climb(
-                    self.rivalries[which], start, self.ways, self.limits, place=place, steps=self.steps
-                )
-                with open(kept / f"{number}.part", "wb") as stream:
-                    np.save(stream, tile)
-                (kept / f"{number}.part").replace(file)
-            tiles.append(np.load(file))
-            self.chosen.append(name)
-        return tiles
-
-    def random_tiles(self, prints: int) -> list[np.ndarray]:
-        """As many tiles of random structure."""
-        self.chosen = ["random"]
-        return [
-            random_level(self.limits, self.tile_px, self.seed + 31 + i).astype(np.float32)
-            for i in range(self._count(prints))
-        ]
-
-    def _count(self, prints: int) -> int:
-        return _TILES if self.size_px > self.tile_px else prints
-
-    def forget(self) -> None:
-        """Remove the kept tiles: the plan is there."""
-        shutil.rmtree(self.cache, ignore_errors=True)
-
-    def _ranked(self, rivalry: Rivalry) -> list[tuple[str, np.ndarray]]:
-        found = [
-            (name, level)
-            for name, level in starts(self.tile_px, self.limits, self.seed)
-            if _repeats(level) <= _MOST_REPEATING
-        ]
-        scores = {name: score(rivalry, level, self.ways) for name, level in found}
-        return sorted(found, key=lambda one: -scores[one[0]])
-
-    def _announce(self, count: int, done: int) -> None:
-        """Say before the work begins how long it will take, from one step of it."""
-        rivalry = max(self.rivalries, key=lambda one: len(one.pairs))
-        level = random_level(self.limits, self.tile_px, self.seed)
-        clock = time.perf_counter()
-        refitted = rivalry.refitted([PlannedPrint(as_tensor(level), self.ways)])
-        refit_s, clock = time.perf_counter() - clock, time.perf_counter()
-        soft = as_tensor(level).requires_grad_()
-        nearest = range(min(NEAREST, len(rivalry.pairs)))
-        rivalry.separations([PlannedPrint(soft, self.ways)], refitted, nearest).sum().backward()
-        step_s = time.perf_counter() - clock
-        tile_s = self.steps * step_s + (1 + self.steps / 10) * refit_s
-        area = (self.size_px / self.tile_px) ** 2
-        # Two prints and two random ones are judged: a refit each and two rounds, and all draws.
-        judged = 12 + 4 * DRAWS
-        rest_s = len(self.rivalries) * (13 * refit_s + judged * area * refit_s)
-        total_s = (count - done) * tile_s + rest_s
-        kept = f", {done} of {count} tiles are kept from an earlier run" if done else ""
-        self.report(f"this takes about {max(1, round(total_s / 60))} min on one core{kept}")
+    Args:
+        kept: folder of finished tiles; those of an interrupted run are taken as they are.
+    """
+    kept.mkdir(parents=True, exist_ok=True)
+    report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
+    ranked = []
+    for rivalry in rivalries:
+        found = [one for one in starts(tile_px, limits, seed) if _repeats(one[1]) <= _MOST_REPEATING]
+        ranked.append(sorted(found, key=lambda one: -score(rivalry, one[1], chosen.ways)))
+    tiles, names = [], []
+    for number in range(count):
+        rank, which = divmod(number, len(rivalries))
+        name, start = ranked[which][rank % len(ranked[which])]
+        file = kept / f"{number}.npy"
+        if not file.is_file():
+            rivalry = rivalries[which]
+            report(f"tile {number + 1} of {count}: from {name}, for {rivalry.question.name}")
+            tile = climb(rivalry, start, chosen.ways, limits, place=chosen.places[0], steps=steps)
+            with atomic_file(file) as temporary:
+                np.save(temporary, tile)
+        tiles.append(np.load(file))
+        names.append(name)
+    return tiles, names
 
 
 def _repeats(level: np.ndarray) -> float:
     """How well a layout repeats itself, as its registration will judge it: 1 where any shift does as well."""
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)
-
-
-def random_level(limits: Limits, size_px: int, seed: int) -> np.ndarray:
-    level = random_layout(
-        (size_px, size_px),
-        levels=limits.highest + 1,
-        cutoff_per_um=limits.cutoff_per_um,
-        pitch_um=limits.pitch_um,
-        seed=seed,
-    )
-    return np.maximum(level, np.uint8(limits.lowest))
-
-
-def as_tensor(level: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(level.astype(np.float32))

@@ -7,9 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.cards.card import Use
 from litho_data.foundation.files import atomic_file
 from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.layouts.patterns import flat, framed_ladder
+from litho_models.planning.designer import WORDS
+from litho_models.planning.layouts import Limits
 from litho_models.planning.record import NextPrint, PlannedScan
+from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 
 PRINT_PATTERN = r"N(?P<print>\d+)F\d+"
 PRINTER_SHEET, MICROSCOPE_SHEET = "printer.md", "microscope.md"
@@ -36,16 +41,55 @@ _USES = {
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 
 
-def write_plan(
-    folder: Path,
-    plan: NextPrint,
-    layouts: Sequence[np.ndarray],
-    *,
-    pitch_um: float,
-    level_height_um: float,
-    levels: int,
-    write_field_um: float | None,
-) -> None:
+_TREAD_PX = 30
+_LADDER_PX = 5 * _TREAD_PX
+
+
+def schedule(
+    planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
+) -> tuple[list[PlannedScan], list[np.ndarray]]:
+    """The rows of the table, and the layout of each."""
+    size_px = len(planned[0].level)
+    # A stair alone looks the same wherever it is shifted; without room for a frame it is left to chance.
+    ladder = limits.random(size_px, seed + 13)
+    if size_px >= _LADDER_PX:
+        ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
+    unprinted = flat((size_px, size_px), level=0)
+    middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
+    scans: list[PlannedScan] = []
+    levels: list[np.ndarray] = []
+
+    def add(use: Use, number: int, at: int, level: np.ndarray, one: PlannedPrint, way: Way, why: str) -> None:
+        reach_um = printing.reach_um(one)
+        levels.append(level)
+        scans.append(
+            PlannedScan(
+                id=f"N{number}F{at}",
+                print=str(number),
+                order=len(scans),
+                use=use,
+                **vars(way),
+                field_x_um=reach_um,
+                field_y_um=reach_um,
+                dose=one.dose,
+                why=why,
+            )
+        )
+
+    plain = PlannedPrint(planned[0].level, ())
+    add("substrate", 0, 1, unprinted, plain, Way(), "zero, tilt and bow without a print")
+    add("flat", 0, 2, middle, plain, Way(), "the noise floor")
+    add("steps", 0, 3, ladder, plain, Way(), "height against level; the microscope's gain on a step standard")
+    add("grating", 0, 4, unprinted, plain, Way(), "scales and unevenness of the scanner, and the tip")
+    for number, one in enumerate(planned, start=1):
+        for at, way in enumerate(one.ways, start=1):
+            why = WORDS.get(way, "as the prints so far")
+            why += f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
+            add("dataset", number, at, one.level.numpy().astype(np.uint8), one, way, why)
+    return scans, levels
+
+
+def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
     """Write card, table, layouts and sheets; ``layouts``: the level map of each scan."""
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
@@ -53,13 +97,13 @@ def write_plan(
     CardText(
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide what is open on {plan.dataset.name}",
-        pitch_um=pitch_um,
-        level_height_um=level_height_um,
-        levels=levels,
+        pitch_um=printing.pitch_um,
+        level_height_um=printing.level_height_um,
+        levels=printing.highest + 1,
         scan_size_um=(plan.field_um, plan.field_um),
         print_pattern=PRINT_PATTERN,
         slow_axis="y",
-        write_field_um=write_field_um,
+        write_field_um=printing.write_field_um,
         plan_of=plan.dataset.sha256,
         grating_um=_grating_um(plan),
     ).write(folder)
@@ -70,16 +114,7 @@ def write_plan(
 
 
 def _grating_um(plan: NextPrint) -> float:
-    fitting = [period for period in _PERIODS_UM if _FEWEST_PERIODS * period <= plan.field_um]
-    return max(fitting, default=_PERIODS_UM[-1])
-
-
-def _first_scans(plan: NextPrint) -> list[PlannedScan]:
-    seen: dict[tuple[str, str], PlannedScan] = {}
-    for scan in plan.scans:
-        # References share one print number and are fields of their own.
-        seen.setdefault((scan.print, scan.id if scan.use != "dataset" else ""), scan)
-    return list(seen.values())
+    return next((one for one in _PERIODS_UM if _FEWEST_PERIODS * one <= plan.field_um), _PERIODS_UM[-1])
 
 
 def _printer_sheet(plan: NextPrint) -> str:
@@ -92,9 +127,8 @@ def _printer_sheet(plan: NextPrint) -> str:
         "| order | layout | centre in the write field (x, y), µm | dose, of the recipe's | what it is |",
         "|---|---|---|---|---|",
     ]
-    for scan in _first_scans(plan):
-        if scan.use == "grating":
-            continue
+    printed = [scan for scan in plan.scans if scan.use in _USES or scan.id.endswith("F1")]
+    for scan in printed:
         what = "print" if scan.use == "dataset" else _USES[scan.use]
         place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
         lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {scan.dose:g} | {what} |")

@@ -14,47 +14,41 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.layouts.patterns import checkerboard, isolated_features, line_space_sweep
+from litho_data.layouts.patterns import checkerboard, line_space_sweep
 from litho_data.layouts.random_layout import quantise, random_layout
-from litho_models.effects.chain import EffectChain
-from litho_models.loop.result.questions import OpenQuestions
+from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
 TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Directed pairs that a layout climbs for until the next refit: the farther ones take care of themselves.
-NEAREST = 4
 # Levels rarer than this in the prints so far are not known to the models.
 _RARE = 1e-3
-_POWER_KNOWN = 0.95
-# Mean distance of sorted levels from those of the prints so far, in levels, that costs nothing.
+# Distance of mean and spread of the levels from those of the prints so far that costs nothing.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
-_FEWEST_TREADS = 3
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be printed: levels, cut-off (cycles/µm), and the levels of the prints so far, sorted."""
+    """What may be printed: levels, cut-off (cycles/µm), and mean and spread of the levels so far."""
 
     lowest: int
     highest: int
     cutoff_per_um: float
     pitch_um: float
-    known: np.ndarray
+    mean: float
+    sd: float
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Levels with a share of a thousandth, and frequencies up to where 95 % of the power lies."""
+        """Levels with a share of a thousandth, and structure no finer than in the prints so far."""
         share = np.array(open_.level_share)
-        levels = np.flatnonzero(share >= _RARE)
-        cumulative = np.cumsum(open_.power_share) / max(sum(open_.power_share), 1e-12)
-        cutoff = float(np.array(open_.frequency_per_um)[np.searchsorted(cumulative, _POWER_KNOWN)])
-        quantiles = (np.arange(4096) + 0.5) / 4096
-        known = np.searchsorted(np.cumsum(share) / share.sum(), quantiles).astype(np.float32)
-        return cls(int(levels[0]), int(levels[-1]), cutoff, pitch_um, known)
+        known, levels = np.flatnonzero(share >= _RARE), np.arange(len(share))
+        mean = float(share @ levels)
+        sd = float(np.sqrt(share @ (levels - mean) ** 2))
+        return cls(int(known[0]), int(known[-1]), open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
         """Printable soft levels (y, x) nearest to free ones."""
@@ -71,13 +65,21 @@ class Limits:
         return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
 
     def price(self, soft: Tensor) -> Tensor:
-        """What levels far from those of the prints so far cost."""
-        quantiles = torch.quantile(
-            soft.reshape(-1)[:: max(1, soft.numel() // 16384)],
-            (torch.arange(256) + 0.5) / 256,
+        """The cost of levels whose mean or spread is far from that of the prints so far."""
+        far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
+        return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
+
+    def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
+        """Random structure, (size, size) whole levels; ``finest``: share of the cut-off."""
+        level = random_layout(
+            (size_px, size_px),
+            levels=self.highest + 1,
+            # A small print holds one period of something at least.
+            cutoff_per_um=max(finest * self.cutoff_per_um, 1.001 / (size_px * self.pitch_um)),
+            pitch_um=self.pitch_um,
+            seed=seed,
         )
-        known = torch.from_numpy(self.known[8::16].copy())
-        return _PRICE * torch.relu((quantiles - known).abs().mean() - _FREE_LEVELS) ** 2
+        return np.maximum(level, np.uint8(self.lowest))
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
@@ -86,40 +88,20 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     Patterns lie in a frame of random structure, a fifth of the side wide: a scan of what repeats itself
     cannot be registered.
     """
-    shape, high, low = (size_px, size_px), limits.highest, limits.lowest
+    for number, finest in enumerate((1.0, 0.5, 0.8)):
+        yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
+    high, low = limits.highest, limits.lowest
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
-    levels = limits.highest + 1
-    for number in range(3):
-        cutoff = limits.cutoff_per_um * (1.0, 0.5, 0.8)[number]
-        level = random_layout(
-            shape, levels=levels, cutoff_per_um=cutoff, pitch_um=limits.pitch_um, seed=seed + number
-        )
-        yield f"random-{number + 1}", np.maximum(level, low)
-    frame = random_layout(
-        shape, levels=levels, cutoff_per_um=limits.cutoff_per_um, pitch_um=limits.pitch_um, seed=seed + 7
-    )
-    frame = np.maximum(frame, np.uint8(low))
     inset = size_px // 5
-    room, inner = (slice(inset, size_px - inset),) * 2, size_px - 2 * inset
+    shape = (size_px - 2 * inset,) * 2
     patterns = {
-        "checkerboard": checkerboard((inner, inner), cell_px=2 * feature, high=high, low=low),
-        "lines": line_space_sweep((inner, inner), high=high, low=low, narrowest_px=feature),
-        "lines-along-x": line_space_sweep(
-            (inner, inner), high=high, low=low, narrowest_px=feature, along="x"
-        ),
+        "checkerboard": checkerboard(shape, cell_px=2 * feature, high=high, low=low),
+        "lines": line_space_sweep(shape, high=high, low=low, narrowest_px=feature),
+        "lines-along-x": line_space_sweep(shape, high=high, low=low, narrowest_px=feature, along="x"),
     }
-    if inner >= _FEWEST_TREADS * 2 * feature:
-        steps = min(levels - low, inner // (2 * feature))
-        stairs = np.rint(np.linspace(low, high, steps)).astype(np.uint8)
-        patterns["stairs"] = np.broadcast_to(stairs[np.arange(inner) * steps // inner], (inner, inner))
-    widths = [feature + 2 * i for i in range(9) if 3 * (feature + 2 * i) <= inner // 3]
-    if widths:
-        middle = (high + low) // 2
-        for name, top in (("pillars", high), ("pits", low)):
-            patterns[name] = isolated_features((inner, inner), widths_px=widths, feature=top, ground=middle)
     for name, pattern in patterns.items():
-        whole = frame.copy()
-        whole[room] = pattern
+        whole = limits.random(size_px, seed + 7)
+        whole[inset:-inset, inset:-inset] = pattern
         yield name, whole
 
 
@@ -131,11 +113,8 @@ def score(
     doses: Sequence[float] = (1.0,),
 ) -> float:
     """Separation of the nearest pair by a print of this layout at each of the doses, standard deviations."""
-    soft = torch.from_numpy(level.astype(np.float32))
-    prints = [PlannedPrint(soft, ways, place, dose=dose) for dose in doses]
-    refitted = rivalry.refitted(prints)
-    with torch.no_grad():
-        return float(rivalry.separations(prints, refitted).min())
+    prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
+    return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
 
 
 def climb(
@@ -148,29 +127,21 @@ def climb(
     steps: int = STEPS,
 ) -> np.ndarray:
     """Soft levels (y, x) at the top of the way up from ``start``."""
-    free = torch.from_numpy(start.astype(np.float32)).requires_grad_()
+    free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
-    refitted: list[EffectChain] = []
-    nearest: list[int] = []
     for step in range(steps + 1):
         soft = limits.soft(free)
-        if step % _REFIT_EVERY == 0 or step == steps:
-            here = [PlannedPrint(soft.detach(), ways, place)]
-            refitted = rivalry.refitted(here)
-            with torch.no_grad():
-                apart = rivalry.separations(here, refitted)
-            nearest = torch.argsort(apart)[:NEAREST].tolist()
-            # Only where the partners are those of this very layout is the height true.
-            if float(apart.min()) > highest:
-                best, highest = soft.detach().numpy().copy(), float(apart.min())
-        if step == steps:
-            break
+        fresh = step % _REFIT_EVERY == 0 or step == steps
+        if fresh:
+            refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
+        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
+        # Only where the partners are those of this very layout is the height true.
+        if fresh and apart.min().item() > highest:
+            best, highest = soft.detach().numpy().copy(), apart.min().item()
         # The nearest pair, softly: with the hard minimum two pairs would take turns.
-        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted, nearest)
-        height = -torch.logsumexp(-apart, 0)
         climber.zero_grad()
-        (limits.price(soft) - height).backward()
+        (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()
     return best
 
@@ -178,10 +149,11 @@ def climb(
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
     """Whole levels (size, size) of one print: the tiles side by side, in another order for each print."""
     side = -(-size_px // tiles[0].shape[0])
-    rows = []
-    for row in range(side):
-        places = [(row * side + column + number) % len(tiles) for column in range(side)]
-        rows.append(np.concatenate([tiles[place] for place in places], axis=1))
-    whole = np.concatenate(rows)[:size_px, :size_px]
-    smooth = limits.soft(torch.from_numpy(whole.astype(np.float32)))
-    return limits.whole(smooth.numpy())
+    order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
+    whole = np.block([order[row * side : (row + 1) * side] for row in range(side)])[:size_px, :size_px]
+    return limits.whole(limits.soft(as_tensor(whole)).numpy())
+
+
+def as_tensor(level: np.ndarray) -> Tensor:
+    """Levels for a planned print."""
+    return torch.from_numpy(level.astype(np.float32))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
+from pydantic import Field
+
 from litho_data.cards.card import Use
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
@@ -22,10 +24,10 @@ class PlannedScan(Record):
     turned_deg: int
     direction: int
     tip: int
-    pixel_size: float = 1.0
+    pixel_size: float
     field_x_um: float
     field_y_um: float
-    dose: float = 1.0
+    dose: float
     why: str
 
 
@@ -51,12 +53,12 @@ class PlannedQuestion(Record):
     text: str
     status: Status
     why: str
-    rivals: list[str]
-    pairs: list[PlannedPair]
-    difference_nm: float | None
-    random_difference_nm: float | None
-    noise_nm: float | None
-    form_nm: float | None = None
+    rivals: list[str] = Field(default_factory=list)
+    pairs: list[PlannedPair] = Field(default_factory=list)
+    difference_nm: float | None = None
+    random_difference_nm: float | None = None
+    noise_nm: float | None = None
+    form_nm: float | None
     power: list[float]
     random_power: list[float]
     prints_needed: int | None
@@ -67,12 +69,11 @@ class NextPrint(Result):
     """A plan: what to print and scan, and what it will decide; ``settings``: what was asked for."""
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
-    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/next-print/1",)
     FILE_NAME: ClassVar[str] = "plan.json"
 
     run: RunInfo
     dataset: DatasetId
-    settings: dict[str, Any] | None = None
+    settings: dict[str, Any]
     prints: int
     field_um: float
     levels: tuple[int, int]

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.foundation.run_facts import run_info
-from litho_data.layouts.patterns import flat, framed_ladder
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
-from litho_models.loop.result.questions import OpenQuestions
-from litho_models.loop.run import MODEL_FOLDER
-from litho_models.planning import answers
-from litho_models.planning.designer import WORDS, Designer, as_tensor, random_level, ways_without_rivals
-from litho_models.planning.folder import HOLDS, write_plan
-from litho_models.planning.layouts import STEPS, Limits, assemble
-from litho_models.planning.record import NextPrint, PlannedQuestion, PlannedScan
+from litho_models.planning.answers import of_others, of_rivals
+from litho_models.planning.designer import TURNED, choose, climbed, together
+from litho_models.planning.folder import HOLDS, schedule, write_plan
+from litho_models.planning.layouts import STEPS, TILE_PX, Limits, as_tensor, assemble
+from litho_models.planning.questions import OpenQuestions
+from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report
-from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry
+from litho_models.twin.saving import MODEL_FOLDER
 
 # Prints on which the rivals are compared at last; the others are made of the same tiles.
 _JUDGED = 2
-_FEWEST_PRINTS = 2
+_FEWEST_PRINTS, _TILES = 2, 4
 _SMALLEST_PX = 64
 
 
@@ -57,8 +57,7 @@ def next_print(
         report: told what happens, a sentence at a time.
 
     Raises:
-        InputError: no closed loop, one from before questions were kept, prints of an impossible size, or a
-            folder with a plan of other settings.
+        InputError: no closed loop, prints of an impossible size, or a folder with a plan of other settings.
     """
     require_replaceable_folder(out, *HOLDS)
     folder = Path(loop)
@@ -66,7 +65,7 @@ def next_print(
         raise InputError(
             f"no {OpenQuestions.FILE_NAME} in {loop}",
             wanted="the folder of a closed loop",
-            hint="litho-models close-loop writes it; results of earlier versions have none",
+            hint="litho-models close-loop writes it",
         )
     open_ = OpenQuestions.read(folder)
     if not open_.questions:
@@ -85,130 +84,67 @@ def next_print(
     base = load_simulator(folder / MODEL_FOLDER, card)
     limits = Limits.of(open_, card.pitch_um)
     printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
-    contested = [q for q in open_.questions if len(q.rivals) > 1]
-    rivalries = [Rivalry(q, base, printing, open_.noise) for q in contested]
-    designer = Designer(rivalries, limits, size_px, seed, steps, Path(cache or f"{out}-cache"), report)
+    contested = [q for q in open_.questions if q.rivals]
+    rivalries = [Rivalry(question, base, printing, open_.noise) for question in contested]
+    tile_px = min(TILE_PX, size_px)
     can_move = open_.write_field_um is not None and open_.write_field_um > field_um
-    designer.choose(ways_without_rivals(open_.questions), can_move)
-    tiles = designer.tiles(folder, prints) if layouts == "optimised" else designer.random_tiles(prints)
-    levels = [assemble(tiles, number, size_px, limits) for number in range(prints)]
-    orders = np.linspace(-0.5, 0.5, prints) if prints > 1 else np.zeros(1)
+    choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
+    # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
+    turned = (TURNED,) if any(q.kind in ("lines", "per-scan") for q in open_.questions) else ()
+    chosen = together(choices, turned)
+    count = _TILES if size_px > tile_px else prints
+    tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
+    kept_in = Path(cache or f"{out}-cache")
+    if rivalries and layouts == "optimised":
+        kept = kept_in / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
+        tiles, starts = climbed(
+            rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
+        )
     planned = [
-        PlannedPrint(as_tensor(level), designer.ways, designer.place(i), float(order), designer.dose(i))
-        for i, (level, order) in enumerate(zip(levels, orders, strict=True))
+        PlannedPrint(
+            as_tensor(assemble(tiles, number, size_px, limits)),
+            chosen.ways,
+            chosen.places[number % len(chosen.places)],
+            number / max(prints - 1, 1) - 0.5,
+            chosen.doses[number % len(chosen.doses)],
+        )
+        for number in range(prints)
     ]
     report("comparing the rivals on the planned prints, and on random ones")
+    judged = planned[:_JUDGED]
     random = [
-        replace(one, level=as_tensor(random_level(limits, size_px, seed + 101 + i)))
-        for i, one in enumerate(planned[:_JUDGED])
+        replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i))) for i, one in enumerate(judged)
     ]
-    judged = {
-        rivalry.question.name: answers.of_rivals(rivalry, planned[:_JUDGED], random, tried, prints)
-        for rivalry, tried in zip(rivalries, designer.tried, strict=True)
+    answered = {
+        rivalry.question.name: of_rivals(rivalry, judged, random, choice.tried, prints)
+        for rivalry, choice in zip(rivalries, choices, strict=True)
     }
-    answered = [
-        judged.get(q.name) or answers.of_others(q, open_, prints, len(designer.ways), size_px)
-        for q in open_.questions
+    scans_each = len(chosen.ways)
+    questions = [
+        answered.get(q.name) or of_others(q, open_, prints, scans_each, size_px) for q in open_.questions
     ]
-    count = _fewest(answered, prints)
-    planned, levels = planned[:count], levels[:count]
-    scans, maps = schedule(planned, levels, answered, limits, printing, seed)
+    needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
+    # One print alone may have a defect.
+    planned = planned[: max([_FEWEST_PRINTS, *needed])]
+    scans, maps = schedule(planned, limits, printing, seed)
+    levels = np.stack([one.level.numpy() for one in planned]).astype(int)
+    share = np.bincount(levels.ravel(), minlength=card.levels) / levels.size
     plan = NextPrint(
         run=run_info([seed], len(scans)),
         dataset=open_.dataset,
         settings=asked,
-        prints=count,
+        prints=len(planned),
         field_um=field_um,
         levels=(limits.lowest, limits.highest),
         cutoff_per_um=limits.cutoff_per_um,
         smallest_feature_um=0.5 / limits.cutoff_per_um,
-        level_distance=_level_distance(levels, open_.level_share),
-        starts=designer.chosen,
+        level_distance=float(0.5 * np.abs(share - open_.level_share).sum()),
+        starts=starts,
         scans=scans,
-        questions=answered,
+        questions=questions,
     )
     with atomic_folder(out) as target:
-        write_plan(
-            target,
-            plan,
-            maps,
-            pitch_um=card.pitch_um,
-            level_height_um=card.level_height_um,
-            levels=card.levels,
-            write_field_um=open_.write_field_um,
-        )
-        write_report(target, plan, levels, rivalries, planned[0])
-    designer.forget()
+        write_plan(target, plan, maps, printing)
+        write_report(target, plan, rivalries, planned)
+    shutil.rmtree(kept_in, ignore_errors=True)
     return plan
-
-
-def _fewest(questions: Sequence[PlannedQuestion], allowed: int) -> int:
-    """Prints that decide all that the allowed number decides; all where some question is left over."""
-    asked = [q.prints_needed or allowed for q in questions if q.status in ("decides", "may decide")]
-    # One print alone may have a defect.
-    return min(allowed, max([_FEWEST_PRINTS, *asked]))
-
-
-def _level_distance(levels: Sequence[np.ndarray], known: Sequence[float]) -> float:
-    counts = np.bincount(np.concatenate([one.ravel() for one in levels]), minlength=len(known))
-    return float(0.5 * np.abs(counts / counts.sum() - np.array(known)).sum())
-
-
-_TREAD_PX = 30
-_LADDER_PX = 5 * _TREAD_PX
-
-
-def schedule(
-    planned: Sequence[PlannedPrint],
-    levels: Sequence[np.ndarray],
-    questions: Sequence[PlannedQuestion],
-    limits: Limits,
-    printing: Printing,
-    seed: int,
-) -> tuple[list[PlannedScan], list[np.ndarray]]:
-    """The rows of the table, and the layout of each."""
-    size_px = levels[0].shape[0]
-    # A stair alone looks the same wherever it is shifted; without room for a frame it is left to chance.
-    ladder = random_level(limits, size_px, seed + 13)
-    if size_px >= _LADDER_PX:
-        ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
-    unprinted = np.zeros((size_px, size_px), np.uint8)
-    references: list[tuple[Use, np.ndarray, str]] = [
-        ("substrate", unprinted, "zero, tilt and bow without a print"),
-        ("flat", flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2), "the noise floor"),
-        ("steps", ladder, "height against level; on a step standard of known height the microscope's gain"),
-        ("grating", unprinted, "scales and unevenness of the scanner, and the tip"),
-    ]
-    rows: list[tuple[str, str, Use, Way, float, float, str, np.ndarray]] = []
-    for number, (use, level, why) in enumerate(references, start=1):
-        rows.append((f"N0F{number}", "0", use, Way(), 0.0, 1.0, why, level))
-    for number, (one, level) in enumerate(zip(planned, levels, strict=True), start=1):
-        reach_um = 0.0
-        if one.place == "edge" and printing.write_field_um is not None:
-            reach_um = (printing.write_field_um - size_px * printing.pitch_um) / 2
-        for at, way in enumerate(one.ways, start=1):
-            why = WORDS.get(way, "as the prints so far").split(":")[0]
-            if one.dose != 1:
-                why += f"; the print has {one.dose:g} of the dose"
-            rows.append((f"N{number}F{at}", str(number), "dataset", way, reach_um, one.dose, why, level))
-    if any(q.kind == "generic" and "early print" in q.why for q in questions):
-        why = "the first print once more at the end: what changed in between is the microscope's"
-        rows.append((f"N1F{len(planned[0].ways) + 1}", "1", "dataset", Way(), 0.0, 1.0, why, levels[0]))
-    scans = [
-        PlannedScan(
-            id=scan_id,
-            print=block,
-            order=order,
-            use=use,
-            turned_deg=way.turned_deg,
-            direction=-1 if way.backward else 1,
-            tip=2 if way.new_tip else 1,
-            pixel_size=way.pixel_size,
-            field_x_um=reach_um,
-            field_y_um=reach_um,
-            dose=dose,
-            why=why,
-        )
-        for order, (scan_id, block, use, way, reach_um, dose, why, _) in enumerate(rows)
-    ]
-    return scans, [row[-1] for row in rows]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
@@ -125,6 +126,11 @@ class MeasurementModel(Record):
                 seen = seen + own[0] * (seen - seen.mean())
         seen = _levelled(seen, scan.usable, self.levelling)
         return seen + self.background_um(scan)
+
+    def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
+        """The scan without what this adds to its predicted print (ny, nx), µm."""
+        added = self.expected_um(scan, prediction_um) - prediction_um
+        return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
         """Only what differs between groups: the mean over the labels of a part is taken out of each of them.

@@ -10,7 +10,7 @@ from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.term import Terms, chosen_terms
 
 Policy = Literal["none", "offset", "offset-gain", "full", "full+rows"]
-BackgroundUse = Literal["none", "training"]
+BackgroundUse = Literal["none", "training", "shared"]
 
 POLICIES: dict[Policy, Terms] = {
     "none": frozenset(),
@@ -39,7 +39,8 @@ class NuisanceProtocol(Record):
 
     ``k``: smooth terms per scan; line offsets of ``full+rows`` come on top, by their effective number, which
     depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
-    learned on the training scans was added to the predictions; nothing of it is fitted to the scored scan.
+    learned on the training scans was added to the predictions, ``shared`` if they went through the whole
+    measurement model, learned there with the printer; nothing of it is fitted to the scored scan.
     In older result files ``line_gap_px`` is None, as line offsets came from stripes beside the scored pixels,
     and so is ``border_px``: 0 in a benchmark, 8 in the loop.
     """

@@ -8,8 +8,10 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.results import Record
+from litho_data.store import PrintedScan
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
+from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
@@ -26,6 +28,11 @@ class Prediction(NamedTuple):
         """The print and a learned background on its field, where there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
+
+    @classmethod
+    def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: np.ndarray) -> Prediction:
+        """The print, and what a learned measurement model makes of it on the scan's field."""
+        return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
     def map_um(self) -> np.ndarray:

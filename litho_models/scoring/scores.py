@@ -45,7 +45,7 @@ def score_model(
     heights = [prediction.height_um for prediction in predictions]
     scores = {policy: _scan_scores(scans, maps, policy, blocks) for policy in POLICIES}
     chosen = scores[protocol.policy]
-    bare = _BLIND_POLICIES if protocol.background == "training" else ()
+    bare = _BLIND_POLICIES if protocol.background != "none" else ()
     residuals, lines = [], []
     for scan, expected in zip(scans, maps, strict=True):
         arrays = (scan.height_um, expected, scan.valid)

@@ -7,7 +7,7 @@ other scan. Whatever is judged on scans is chosen without them by calling it on 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,14 +17,15 @@ from litho_data.store import PrintedScan
 from litho_models.effects import Effect, screened_effects
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 from litho_models.fitting.least_squares import fit_least_squares
-from litho_models.loop.explainable import Learner, Rest
-from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 from litho_models.twin.adequacy import reshaped_gain
 from litho_models.twin.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
 from litho_models.twin.judging import judge
+from litho_models.twin.learner import Learner, Rest
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.twin.search import Cause, Found, search, untestable
+from litho_models.twin.search import describe as describe_rest
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
@@ -89,7 +90,7 @@ class Closed:
         study: the scans, freed of what they share by group.
         plain: the base fitted to the scans as they are; ``base``: to the freed ones.
         named: the search among causes; ``checked``: each of its causes with the check of its formula.
-        lawful, described: the searches among laws and descriptions, each beside all before.
+        lawful: the search among laws, beside the causes; ``described``: where the rest lies, beside both.
         rests: what features of layout and place still explain, by stage.
         untestable: effects that could not be tested, with the reason.
     """
@@ -101,7 +102,7 @@ class Closed:
     named: Found
     checked: list[Checked]
     lawful: Found
-    described: Found
+    described: list[Cause]
     rests: dict[str, Rest]
     untestable: dict[str, str]
 
@@ -145,11 +146,11 @@ def close(
     named, checked = _named(start, at_work, causes)
     study.report("looking for a law in what is left")
     lawful = search(named.state, at_work, list(LAWS.values()), MOST_LAWS)
-    described = Found(lawful.state)
+    described: list[Cause] = []
     if describe:
         study.report("describing what is left")
-        described = search(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
-    stages = {"base": start, "causes": named.state, "laws": lawful.state, "all": described.state}
+        described = describe_rest(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
+    stages = {"base": start, "causes": named.state, "laws": lawful.state}
     return Closed(
         study=at_work,
         original=original,
@@ -168,45 +169,41 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
     """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
     found = search(start, study, candidates)
     failed: list[Checked] = []
-    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None  # type: ignore[arg-type]
-    while True:
-        left = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2 if learner else 0.0
-        without = {
-            cause.name: fit_state(found.state.twin.without(cause.name), study) for cause in found.causes
-        }
-        found.causes = [
-            replace(cause, judgement=judge(without[cause.name].freed_nm2, found.state.freed_nm2, study))
-            for cause in found.causes
-        ]
-        checked = [
-            Checked(
-                cause,
-                reshaped_gain(without[cause.name], found.state, study),
-                left,
-                _larger(cause, found, without, study),
-            )
-            for cause in found.causes
-        ]
+    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
+    while learner and found.causes:
+        left_nm2 = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2
+        checked = [_checked(cause, found, left_nm2, study) for cause in found.causes]
+        found.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
         wrong = sorted(
             (one for one in checked if not one.holds), key=lambda one: (not one.corrects, one.gain_nm2)
         )
         if not wrong:
             return found, [*checked, *failed]
-        study.report(f"{wrong[0].cause.name}: {wrong[0].reason}")
+        name, reason = wrong[0].cause.name, wrong[0].reason
+        study.report(f"{name}: {reason}")
         failed.append(wrong[0])
-        found.refused[wrong[0].cause.name] = wrong[0].reason
-        found.causes = [cause for cause in found.causes if cause.name != wrong[0].cause.name]
-        found.state = without[wrong[0].cause.name] if found.causes else start
+        found.refused[name] = reason
+        found.causes = [cause for cause in found.causes if cause.name != name]
+        found.state = found.state.without(name, study) if found.causes else start
+    return found, failed
 
 
-def _larger(cause: Cause, found: Found, without: Mapping[str, State], study: Study) -> str:
+def _checked(cause: Cause, found: Found, left_nm2: float, study: Study) -> Checked:
+    """A cause, judged with all others in place."""
+    without = found.state.without(cause.name, study)
+    cause = replace(cause, judgement=judge(without.freed_nm2, found.state.freed_nm2, study))
+    reshaped_nm2 = reshaped_gain(without, found.state, study)
+    return Checked(cause, reshaped_nm2, left_nm2, _larger(cause, found, study))
+
+
+def _larger(cause: Cause, found: Found, study: Study) -> str:
     """A much larger cause whose change in another shape takes what this one does; empty if none."""
-    gain = cause.judgement.gain_nm2
+    gain, without = cause.judgement.gain_nm2, found.state.without(cause.name, study)
     for other in found.causes:
         if gain < SMALL_SHARE * other.judgement.gain_nm2:
-            neither = fit_state(without[cause.name].twin.without(other.name), study)
-            if reshaped_gain(neither, without[cause.name], study) >= REPEATED_SHARE * gain:
+            neither = without.without(other.name, study)
+            if reshaped_gain(neither, without, study) >= REPEATED_SHARE * gain:
                 return other.name
     return ""
 
@@ -231,35 +228,30 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
         for i in np.flatnonzero(study.fold_of == fold).tolist():
-            extra = differences.expected_um(scans[i], maps[i]) - maps[i]
-            freed[i] = replace(scans[i], height_um=(scans[i].height_um - extra).astype(np.float32))
+            freed[i] = differences.freed(scans[i], maps[i])
     return freed
 
 
 def fit_with_measurement(
-    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0
+    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, fold: int | None = None, refit: bool = True
 ) -> tuple[Twin, MeasurementModel]:
     """Printer and measurement fitted to the same scans, one after the other and once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
+        fold: that a base which was trained without each fold must not have seen.
+        refit: the printer, once the measurement is known; or leave it where it is.
     """
     stored = [scan.stored for scan in scans]
     placed = twin.placed()
-    maps = [placed.height(scan) for scan in scans]
+    maps = [placed.height(scan, fold) for scan in scans]
     learned = learn_measurement(stored, maps, seed=seed)
-    freed = [
-        replace(
-            scan,
-            height_um=(scan.height_um - learned.expected_um(scan, own) + own).astype(np.float32),
-        )
-        for scan, own in zip(stored, maps, strict=True)
-    ]
-    if len(twin.vector):
+    if refit and len(twin.vector):
+        freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
-        twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)
         placed = twin.placed()
-        learned = learn_measurement(stored, [placed.height(scan) for scan in scans], seed=seed)
+        learned = learn_measurement(stored, [placed.height(scan, fold) for scan in scans], seed=seed)
     return twin, learned
 
 
@@ -271,6 +263,6 @@ def _rests(stages: dict[str, State], study: Study) -> dict[str, Rest]:
             continue
         seen.append(state)
         maps = held_out_maps(state, study, study.scans)
-        learner = learner or Learner(study, maps)  # type: ignore[arg-type]
+        learner = learner or Learner(study, maps)
         rests[name] = learner.rest(maps)
     return rests

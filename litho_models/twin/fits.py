@@ -6,7 +6,7 @@ What single scans may add is projected out, so that it cannot pull the numbers o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,10 +23,11 @@ from litho_models.fitting.least_squares import (
     orthonormal,
     solve_damped,
 )
-from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.groups import Labels, groupings
+from litho_models.twin.folded_base import FoldedBase
 from litho_models.twin.model import Placed, Twin, finished
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
@@ -92,7 +93,6 @@ class State:
         twin: at the numbers fitted to all scans; ``per_fold``: (folds, p), each without its own scans.
         linear: each window at ``twin``: residual, derivatives, and what the scan may add by itself.
         held_out_um: residual (n,) of each window by the fit that has not seen it.
-        training: (folds,) weighted sum of squares of each fit on its own scans, µm².
         freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
     """
 
@@ -100,12 +100,19 @@ class State:
     per_fold: np.ndarray
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
-    training: np.ndarray
     freed_nm2: np.ndarray
+    # What it is without one of its effects: asked for by every step that judges the effect.
+    _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
+
+    def without(self, name: str, study: Study) -> State:
+        """The model without one of its effects, fitted again from here."""
+        if name not in self._without:
+            self._without[name] = fit_state(self.twin.without(name), study, from_here=True)
+        return self._without[name]
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
@@ -121,11 +128,17 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 
 class TwinProblem:
-    """A twin on windows of scans; derivatives are one-sided differences."""
+    """A twin on windows of scans; derivatives are one-sided differences.
 
-    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
+    Args:
+        fold: of a base that was trained without each fold, the one without this fold; None: for each window
+            the one that has not seen it.
+    """
+
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan], fold: int | None = None):
         self._twin = twin
         self._windows = windows
+        self._fold = fold
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         """Residuals, derivatives and free terms of all windows."""
@@ -141,7 +154,7 @@ class TwinProblem:
     ) -> Linearised:
         twin, own = placed.twin, placed.twin.own
         chain = placed.chain(window)
-        base = placed.base_height(chain, window)
+        base = placed.base_height(chain, window, self._fold)
         prediction = finished(chain, base, window)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
@@ -152,7 +165,7 @@ class TwinProblem:
             there = other.chain(window)
             # What acts on the height leaves the height of the base, most of the work, as it is.
             same = slot is not None and get_effect(slot.effect).acts_on == "height"
-            height = base if same else other.base_height(there, window)
+            height = base if same else other.base_height(there, window, self._fold)
             rows[i] = (window.at_sample(finished(there, height, window)) - value) / step
         basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
         return Linearised(window.height - value, rows, basis)
@@ -160,34 +173,38 @@ class TwinProblem:
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all windows, µm."""
         placed = self._twin.at(vector).placed()
-        return [w.height - w.at_sample(placed.height(w)) for w in self._windows]
+        return [w.height - w.at_sample(placed.height(w, self._fold)) for w in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effects stay within their range, the base does not go too far at once."""
         return self._twin.at(vector).room()
 
 
-def fit_state(twin: Twin, study: Study) -> State:
-    """Fit a twin to all windows of a study, then without each fold in turn, from where it stands."""
+def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
+    """Fit a twin to all windows of a study, then without each fold in turn.
+
+    Args:
+        from_here: begin where the twin stands, or else there or with the base as it is before any fit.
+    """
     windows = study.windows
-    fitted = fit_least_squares(TwinProblem(twin, windows), _best_start(twin, windows), RULES)
+    start = twin.vector if from_here else _best_start(twin, windows)
+    fitted = fit_least_squares(TwinProblem(twin, windows), start, RULES)
     common = twin.at(fitted.vector)
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
-    per_fold, training, held_out = [], [], [np.empty(0)] * len(windows)
+    per_fold, held_out = [], [np.empty(0)] * len(windows)
     freed = np.empty(len(windows))
     for fold in study.folds:
         own = [i for i, of in enumerate(study.fold_of) if of != fold]
-        vector, squares = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own])
+        vector = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own], fold)
         per_fold.append(vector)
-        training.append(squares)
         placed = common.at(vector).placed()
         for i in np.flatnonzero(study.fold_of == fold):
             prediction = placed.height(windows[i], fold)
             held_out[i] = windows[i].height - windows[i].at_sample(prediction)
             left = without_terms(held_out[i][:, None], windows[i], prediction)
             freed[i] = NM_PER_UM**2 * float(np.mean(left**2))
-    return State(common, np.stack(per_fold), linear, held_out, np.array(training), freed)
+    return State(common, np.stack(per_fold), linear, held_out, freed)
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
@@ -213,20 +230,24 @@ def without_terms(
 
 
 def _without(
-    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan]
-) -> tuple[np.ndarray, float]:
-    """Numbers fitted to some of the windows with the derivatives of the common fit; weighted squares, µm².
+    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan], fold: int
+) -> np.ndarray:
+    """Numbers fitted to some of the windows with the derivatives of the common fit.
 
     The common fit, which has seen all windows, is where it starts: nothing may be left there.
     """
-    normal, right, total = eliminated_sum(linear, RULES.term_weight)
     vector = common.vector
     if not len(vector):
-        return vector, total
+        return vector
+    if isinstance(common.base, FoldedBase):
+        # At the common fit each window was predicted by a model that has seen the fold.
+        left = TwinProblem(common, windows, fold).residuals(vector)
+        linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
+    normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(_FOLD_STEPS):
         here = common.at(vector)
         trial = vector + solve_damped(normal, right, _FOLD_DAMPING, here.room())
-        left = TwinProblem(common, windows).residuals(trial)
+        left = TwinProblem(common, windows, fold).residuals(trial)
         moved = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
         _, right, squares = eliminated_sum(moved, RULES.term_weight)
         if squares > total:
@@ -234,4 +255,4 @@ def _without(
         vector, gained, total = trial, total - squares, squares
         if gained <= _FOLD_GAIN * squares:
             break
-    return common.at(vector).known_from(windows).vector, total
+    return common.at(vector).known_from(windows).vector

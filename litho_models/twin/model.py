@@ -14,10 +14,10 @@ from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
-from litho_models.loop.folded_base import FoldedBase
-from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.groups import ALL, label_of
 from litho_models.simulator import Simulator, is_small
+from litho_models.twin.folded_base import FoldedBase
+from litho_models.twin.prepared import PreparedScan
 
 Values = dict[str, dict[str, float]]
 # Of the usual size of a number: a step of its difference quotient, and how near a bound is on it.
@@ -44,6 +44,8 @@ class Twin:
         slots: the fitted numbers of the effects, in the order of ``vector``, after those of the base.
         vector: all fitted numbers.
         full_height_um, pitch_um: of the layouts.
+        scan_frame, print_frame: effects that turn with the scan, or keep to the print, whatever the catalogue
+            says; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -53,13 +55,20 @@ class Twin:
     vector: np.ndarray
     full_height_um: float
     pitch_um: float
+    scan_frame: frozenset[str] = frozenset()
+    print_frame: frozenset[str] = frozenset()
 
     @classmethod
     def bare(cls, base: nn.Module, scan: PreparedScan) -> Twin:
         """The base alone, for scans like this one."""
+        return cls.of_base(base, scan.context.full_height_um, scan.context.pitch_um)
+
+    @classmethod
+    def of_base(cls, base: nn.Module, full_height_um: float, pitch_um: float) -> Twin:
+        """The base alone, for layouts of this height and pitch."""
         own = [p.detach().numpy().reshape(-1) for p in _parameters(base)]
         vector = np.concatenate(own or [np.empty(0)]).astype(np.float64)
-        return cls(base, {}, {}, (), vector, scan.context.full_height_um, scan.context.pitch_um)
+        return cls(base, {}, {}, (), vector, full_height_um, pitch_um)
 
     @property
     def own(self) -> int:
@@ -108,11 +117,22 @@ class Twin:
             vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
         )
 
+    def alone(self) -> Twin:
+        """The same without any effect."""
+        return replace(self, by={}, choices={}, slots=(), vector=self.vector[: self.own])
+
+    def ungrouped(self) -> Twin:
+        """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
+        twin = self.alone()
+        for name, values in self.values({}).items():
+            twin = twin.with_effect(name, ALL, {"": values})
+        return twin
+
     def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
         """The same effects over another base."""
         bare = Twin.bare(base, scan)
         vector = np.concatenate([bare.vector, self.vector[self.own :]])
-        return Twin(base, self.by, self.choices, self.slots, vector, self.full_height_um, self.pitch_um)
+        return replace(self, base=base, vector=vector)
 
     def with_base_unfitted(self) -> np.ndarray:
         """The numbers with the base's as they are before any fit."""
@@ -218,12 +238,19 @@ class Placed:
 
     def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
         """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
-        labels = self.twin.labels(scan)
+        return self.of_labels(self.twin.labels(scan), extra)
+
+    def of_labels(self, labels: Mapping[str, str], extra: Values | None = None) -> EffectChain:
+        """The chain for scans with these labels, by grouping; without any it has the mean strengths."""
         key = tuple(labels.values())
         if extra is not None or key not in self._chains:
-            values = {**self.twin.values(labels), **(extra or {})}
             chain = EffectChain(
-                self.base, values, full_height_um=self.twin.full_height_um, pitch_um=self.twin.pitch_um
+                self.base,
+                {**self.twin.values(labels), **(extra or {})},
+                full_height_um=self.twin.full_height_um,
+                pitch_um=self.twin.pitch_um,
+                scan_frame=self.twin.scan_frame,
+                print_frame=self.twin.print_frame,
             )
             if extra is not None:
                 return chain

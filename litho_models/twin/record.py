@@ -9,7 +9,7 @@ from pydantic import Field
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.effects.effect import Knowledge
+from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy
 from litho_models.scoring.pairs import OverUnits
@@ -28,6 +28,7 @@ CandidateVerdict = Literal[
     "too-few-scans",
 ]
 Stage = Literal["base", "causes", "all"]
+Decided = Literal["decided", "still open", "none of them", "not shown by these prints"]
 MeasuredBy = Literal["print alone", "published", "shared"]
 
 
@@ -83,7 +84,7 @@ class FoundEffect(Record):
     name: str
     title: str
     knowledge: Knowledge
-    role: Literal["process", "measurement", "nuisance", "undetermined"]
+    role: Role
     stage: str
     verdict: EffectVerdict
     by: str
@@ -111,6 +112,40 @@ class Candidate(Record):
     gain_nm2: float | None = None
 
 
+class ScanFinding(Record):
+    """What single scans add, each its own, or what is seen in them directly; no model has it.
+
+    Attributes:
+        seen: whether it is there; ``evidence``: in a sentence; ``p``: of its test.
+        spread: parameter to its standard deviation over scans.
+        confusable_with: what these scans cannot tell from it.
+    """
+
+    name: str
+    title: str
+    role: Role
+    seen: bool
+    evidence: str
+    p: float | None
+    spread: dict[str, Strength] = Field(default_factory=dict)
+    confusable_with: list[str] = Field(default_factory=list)
+
+
+class Planted(Record):
+    """An effect that was planted in copies of the scans: its amount, what it changes, what was found.
+
+    ``rms_nm``: of the change, free of what single scans may add; ``named``: the set that it is in, empty if
+    it was not found; ``found``: its amount there.
+    """
+
+    name: str
+    amount: float
+    unit: str
+    rms_nm: float
+    named: list[str]
+    found: float | None
+
+
 class Explained(Record):
     """What features of layout and place still explain out of fold, nm²; ``matters``: beyond chance."""
 
@@ -120,11 +155,40 @@ class Explained(Record):
     matters: bool
 
 
+class Comparison(Record):
+    """Two answers on new prints: by how much the first is nearer, in nm² and in standard deviations.
+
+    ``z`` is less what the form of the model may have made of it; ``difference_nm``: between the two, rms.
+    """
+
+    better: str
+    worse: str
+    gain_nm2: float
+    z: float
+    difference_nm: float
+
+
+class Decision(Record):
+    """A question that was open, and what new prints say: the answers declared before, and those left."""
+
+    question: str
+    kind: str
+    declared: list[str]
+    left: list[str]
+    verdict: Decided
+    evidence: str
+    prints: int
+    scans: int
+    comparisons: list[Comparison] = Field(default_factory=list)
+
+
 class CloseLoop(Result):
     """What the loop found.
 
     ``errors``: see ``ErrorRow``; ``gain``: base minus all, k = 1, with the shared measurement, over scans and
-    over prints. ``chosen``: in nested selections, how often each effect was chosen.
+    over prints. ``chosen``: in nested selections, how often each effect was chosen. ``confounded``: fitted
+    numbers that these scans determine together only, with their correlation. ``decisions``: of further
+    stores, about what was open on the first.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -145,9 +209,13 @@ class CloseLoop(Result):
     over_prints: OverUnits | None
     effects: list[FoundEffect]
     candidates: list[Candidate]
+    single_scans: list[ScanFinding] = Field(default_factory=list)
+    planted: list[Planted] = Field(default_factory=list)
+    confounded: list[tuple[str, str, float]] = Field(default_factory=list)
     measurement: MeasurementModel
     explained: list[Explained]
     chosen: dict[str, int] = Field(default_factory=dict)
+    decisions: list[Decision] = Field(default_factory=list)
     verdict: Verdict
     fewest_scans: int
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.record import CloseLoop, ErrorRow, FoundEffect
+from litho_models.twin.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,6 +58,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
             "strengths.csv",
             digits=3,
         )
+    if result.decisions:
+        page.heading("What new prints decide")
+        page.points([decision_text(one) for one in result.decisions])
     page.heading("Where the residual lies")
     page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
     page.table(
@@ -73,6 +76,17 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     )
     page.heading("What scans share beside their prints", folded=True)
     page.paragraph(measurement_text(result))
+    page.heading("What single scans add", folded=True)
+    page.table(
+        [_scan_row(one) for one in result.single_scans],
+        "Each scan its own; no model has it. Spread: standard deviation over scans.",
+        "single_scans.csv",
+    )
+    if result.planted:
+        page.heading("What was planted in copies of the scans")
+        page.table([_planted_row(one) for one in result.planted], "Is it named?", "planted.csv", digits=3)
+    if result.confounded:
+        page.paragraph(f"Known together only: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}.")
     page.heading("Every other candidate", folded=True)
     page.table([one.model_dump() for one in result.candidates], "Why it was not added.", "candidates.csv")
     return page.write(folder)
@@ -121,6 +135,12 @@ def effect_text(one: FoundEffect) -> str:
         f"{one.name}{_by(one)}: {one.title}; {', '.join(sizes)}. It takes {one.gain_nm2:.0f} of "
         f"{one.before_nm2:.0f} nm² and is better on {better} of {count} held-out scans.{alike}{bases}"
     )
+
+
+def decision_text(one: Decision) -> str:
+    """What new prints say of a question."""
+    left = ", ".join(one.left) or "none"
+    return f"New prints on {one.question}: {one.verdict}, {left}. {capitalised(one.evidence)}."
 
 
 def measurement_text(result: CloseLoop) -> str:
@@ -182,6 +202,16 @@ def _residuals(maps: Maps) -> Figure:
 def _effect_row(one: FoundEffect) -> dict[str, object]:
     kept = {"name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm", "family_p"}
     return {**one.model_dump(include=kept), "confusable_with": ", ".join(one.confusable_with)}
+
+
+def _scan_row(one: ScanFinding) -> dict[str, object]:
+    spread = (f"{name} {own.value:.3g} {own.unit}" for name, own in one.spread.items())
+    alike = ", ".join(one.confusable_with)
+    return {**one.model_dump(), "spread": ", ".join(spread), "confusable_with": alike}
+
+
+def _planted_row(one: Planted) -> dict[str, object]:
+    return {**one.model_dump(), "named": ", ".join(one.named) or "no"}
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:

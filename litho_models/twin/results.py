@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.units import NM_PER_UM
-from litho_data.store import PrintedScan
-from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
-from litho_models.fitting.least_squares import eliminated
-from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
+from litho_models.fitting.least_squares import Linearised, eliminated
 from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.pairs import over_prints, over_scans
-from litho_models.scoring.statistics import interval
 from litho_models.simulator import Simulator
-from litho_models.splits.folds import Split
 from litho_models.twin.closing import Closed
 from litho_models.twin.fits import RULES, State
 from litho_models.twin.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan
 from litho_models.twin.record import (
     Candidate,
     CandidateVerdict,
@@ -31,79 +25,37 @@ from litho_models.twin.record import (
     ErrorRow,
     Explained,
     FoundEffect,
-    MeasuredBy,
-    Stage,
+    ScanFinding,
     Strength,
     Verdict,
 )
 from litho_models.twin.screening import SMALLEST_RETAINED
 from litho_models.twin.search import Cause, separating
 
-REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 _BASE_ABSORBS = 1e-2
-
-
-def error_rows(
-    scans: Sequence[PrintedScan],
-    maps_um: Sequence[np.ndarray],
-    *,
-    model: Stage,
-    measurement: MeasuredBy,
-    held_out: Any,
-    numbers: tuple[int, int],
-    seed: int = 0,
-) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy."""
-    rows = []
-    for policy in REPORTED:
-        fits = [
-            cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
-            for scan, own in zip(scans, maps_um, strict=True)
-        ]
-        mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
-        mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
-        rows.append(
-            ErrorRow(
-                model=model,
-                measurement=measurement,
-                policy=policy,
-                k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
-                held_out=held_out,
-                printer_numbers=numbers[0],
-                measurement_numbers=numbers[1],
-                mae_nm=float(np.mean(mae)),
-                mae_ci95_nm=interval(mae),
-                rmse_nm=float(np.sqrt(np.mean(mse))),
-                by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
-            )
-        )
-    return rows
+# Numbers whose estimates move together this much are known together only.
+_CONFOUNDED = 0.95
 
 
 def record(
     closed: Closed,
     errors: list[ErrorRow],
-    measurement: Any,
     *,
-    dataset: DatasetId,
-    base_name: str,
-    settings: dict[str, Any],
-    split: Split,
-    dropped: list[str],
+    single_scans: list[ScanFinding],
     left_out_nm: Mapping[str, float],
-    survives: Mapping[str, list[str]],
-    chosen: Mapping[str, int],
+    survives_on: Mapping[str, list[str]],
+    **given: Any,
 ) -> CloseLoop:
     """The record of one run.
 
     Args:
-        closed: what was found; ``errors``: of ``error_rows``; ``measurement``: learned on all scans.
-        left_out_nm, survives: of each effect, see ``FoundEffect``; ``chosen``: by nested selections.
+        closed: what was found; ``errors``: of ``error_rows``; ``single_scans``: what those add.
+        left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
     """
     study, scans = closed.study, closed.study.scans
     effects = [
-        _found(closed, one, left_out_nm, survives)
-        for one in (*closed.causes, *closed.lawful.causes, *closed.described.causes)
+        _found(closed, one, left_out_nm, survives_on)
+        for one in (*closed.causes, *closed.lawful.causes, *closed.described)
     ]
     before, after = (
         next(
@@ -116,22 +68,19 @@ def record(
     gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
-        run=run_info([study.seed], len(scans), dropped),
-        dataset=dataset,
-        base_model=base_name,
+        **given,
         base_values=_values(closed.base.twin),
         corrected_values=_values(closed.final.twin),
-        settings=settings,
         at_bounds=closed.final.twin.at_bounds(),
-        split=split,
         groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
         errors=errors,
         gain_nm=float(np.mean(gains)),
         over_scans=over_scans(gains, study.seed),
         over_prints=over_prints(gains, prints, study.seed),
         effects=effects,
-        candidates=_candidates(closed, {one.name: one for one in effects}),
-        measurement=measurement,
+        candidates=_candidates(closed, effects, {one.name for one in single_scans}),
+        single_scans=single_scans,
+        confounded=_confounded(closed.final),
         explained=[
             Explained(
                 stage=stage,
@@ -141,7 +90,6 @@ def record(
             )
             for stage, rest in closed.rests.items()
         ],
-        chosen=dict(chosen),
         verdict=_verdict(closed, effects),
         fewest_scans=FEWEST_SCANS,
     )
@@ -177,7 +125,7 @@ def _found(
     closed: Closed,
     cause: Cause,
     left_out_nm: Mapping[str, float],
-    survives: Mapping[str, list[str]],
+    survives_on: Mapping[str, list[str]],
 ) -> FoundEffect:
     effect = get_effect(cause.name)
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
@@ -192,9 +140,7 @@ def _found(
         stage=effect.stage,
         verdict=verdict,
         by=cause.by,
-        strengths=_strengths(
-            closed.final if cause.name in closed.final.twin.by else closed.described.state, closed, cause.name
-        ),
+        strengths=_strengths(closed, cause),
         confusable_with=list(cause.alike),
         separating_experiment=separating([cause.name, *cause.alike]),
         gain_nm2=cause.judgement.gain_nm2,
@@ -205,18 +151,26 @@ def _found(
         group_p=cause.group_p,
         reshaped_share=reshaped,
         left_out_nm=left_out_nm.get(cause.name),
-        survives_on=survives.get(cause.name, []),
+        survives_on=survives_on.get(cause.name, []),
     )
 
 
-def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for."""
+def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
+    """Numbers of an effect with intervals from what each print (or scan) asks for; of a description alone."""
     from scipy.stats import t
 
-    twin, effect = state.twin, get_effect(name)
-    prints = [scan.stored.print_id for scan in closed.study.scans]
-    units = prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in closed.study.scans]
-    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state, units)), 0.0))
+    state, effect, name = closed.final, get_effect(cause.name), cause.name
+    if cause.values:
+        return {
+            parameter: [
+                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
+                for label, values in cause.values.items()
+            ]
+            for parameter, facts in effect.parameters.items()
+        }
+    twin = state.twin
+    units = independent(closed.study.scans)
+    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state.linear, units)), 0.0))
     reach = float(t.ppf(0.975, max(len(set(units)) - 1, 1)))
     found: dict[str, list[Strength]] = {}
     for at, slot in enumerate(twin.slots, twin.own):
@@ -237,11 +191,19 @@ def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Streng
     return found
 
 
-def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
-    """Covariance (p, p) of the fitted numbers, by what each unit asks for at the optimum."""
-    if not len(state.twin.vector):
-        return np.empty((0, 0))
-    parts = [eliminated(part, RULES.term_weight) for part in state.linear]
+def independent(scans: Sequence[PreparedScan]) -> list[str]:
+    """The unit that each scan belongs to in an interval: its print, or itself where prints are too few."""
+    prints = [scan.stored.print_id for scan in scans]
+    return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
+
+
+def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
+    """Covariance (p, p) of fitted numbers, by what each unit asks for at the optimum.
+
+    Args:
+        linear: each window there; ``units``: the print, or the scan, that each belongs to.
+    """
+    parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
     inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
     names = sorted(set(units))
@@ -251,18 +213,34 @@ def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
 
 
-def _candidates(closed: Closed, added: Mapping[str, FoundEffect]) -> list[Candidate]:
-    sets = {other: one.name for one in added.values() for other in one.confusable_with}
+def _confounded(state: State) -> list[tuple[str, str, float]]:
+    """Pairs of fitted numbers that these scans determine together only, with their correlation."""
+    twin = state.twin
+    normal = np.sum([eliminated(part, RULES.term_weight)[0] for part in state.linear], axis=0)
+    free = np.flatnonzero(np.diag(normal) > 0)
+    covariance = np.linalg.pinv(normal[np.ix_(free, free)], rcond=1e-10, hermitian=True)
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / np.outer(sd, sd)
+    own = [*_values(twin)] if len(_values(twin)) == twin.own else [f"base {i}" for i in range(twin.own)]
+    names = [*own, *(" ".join(filter(None, (s.effect, s.parameter, s.label))) for s in twin.slots)]
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation), 1) >= _CONFOUNDED), strict=True)
+    return [(names[free[i]], names[free[j]], float(correlation[i, j])) for i, j in pairs]
+
+
+def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
+    """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
+    sets = {other: one.name for one in added for other in one.confusable_with}
+    done = {*seen, *(one.name for one in added)}
     untestable = {**UNTESTABLE, **closed.untestable}
     found = [
         Candidate(name=name, verdict="not-testable", reason=reason)
         for name, reason in untestable.items()
-        if name not in added
+        if name not in done
     ]
     found += [
         _candidate(closed, name, sets)
         for name, effect in CATALOGUE.items()
-        if name not in {*added, *untestable} and not effect.per_scan
+        if name not in {*done, *untestable} and not effect.per_scan
     ]
     return found
 

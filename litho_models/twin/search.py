@@ -7,7 +7,7 @@ only guesses what a large effect does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +38,7 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
+        values: of its parameters by label, where no model has it.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Cause:
     judgement: Judgement
     family_p: float
     group_p: float | None
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass
@@ -77,6 +79,19 @@ def search(start: State, study: Study, candidates: Sequence[Effect], most: int =
     return found
 
 
+def describe(state: State, study: Study, candidates: Sequence[Effect], most: int) -> list[Cause]:
+    """Those that stand out beside a model, each as a linear fit beside it alone; they enter no model."""
+    screening, found = Screening(state, study, candidates), []
+    for one in _standing(screening, Found(state))[:most]:
+        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
+        if judgement.passed(grouped=one.by != ALL):
+            group_p = None if one.by == ALL else screening.permutation_p(one)
+            found.append(
+                Cause(one.name, one.by, (), judgement, screening.family_p(one), group_p, one.start())
+            )
+    return found
+
+
 def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
     effects = [one for one in candidates if one.name not in found.state.twin.names]
     if not effects:
@@ -88,54 +103,58 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
     for best in standing:
         if best.name in tried:
             continue
-        rivals = [
-            one
-            for one in standing
-            if one.name not in {*tried, best.name}
-            and one.gain_nm2 >= RIVAL_SHARE * best.gain_nm2
-            and abs(screening.cosine(best, one)) >= RIVAL_COSINE
-        ][:RIVALS]
-        fitted = _fitted(found.state, [best, *rivals], study)
-        order = sorted(fitted, key=lambda name: float(fitted[name].freed_nm2.mean()))
-        entered = {one.name: one for one in (best, *rivals)}
-        for name in order:
-            if name in tried:
+        entering = [best, *_rivals(best, [one for one in standing if one.name not in tried], screening)]
+        fitted = _fitted(found.state, entering, study)
+        for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
+            tried.add(one.name)
+            judgement = judge(found.state.freed_nm2, fitted[one.name].freed_nm2, study)
+            if refused := judgement.reason(grouped=one.by != ALL):
+                found.refused[one.name] = refused
                 continue
-            tried.add(name)
-            state, one = fitted[name], entered[name]
-            judgement = judge(found.state.freed_nm2, state.freed_nm2, study)
-            grouped_p = None if one.by == ALL else screening.permutation_p(one)
-            if not judgement.passed(grouped=one.by != ALL):
-                found.refused[name] = judgement.reason(grouped=one.by != ALL)
-                continue
-            alike = [
-                other
-                for other in order
-                if other != name
-                and same_change(found.state, state, fitted[other])
-                and not told_apart(found.state.freed_nm2, state.freed_nm2, fitted[other].freed_nm2, study)
-            ]
-            alike += [
-                other.name
-                for other in screening.candidates
-                if other.by == one.by
-                and other.name not in {*fitted, *alike}
-                and other.allowed
-                and other.gain_nm2 >= 0.5 * one.gain_nm2
-                and abs(screening.cosine(one, other)) >= SAME_COSINE
-            ]
-            cause = Cause(
-                name, one.by, tuple(dict.fromkeys(alike)), judgement, screening.family_p(one), grouped_p
-            )
-            found.causes.append(cause)
-            found.state = state
-            found.refused.pop(name, None)
-            study.report(
-                f"adding {name}{'' if one.by == ALL else ' by ' + one.by}: {judgement.gain_nm2:.0f} nm² of "
-                f"{judgement.before_nm2:.0f} nm² on held-out scans"
-            )
+            group_p = None if one.by == ALL else screening.permutation_p(one)
+            alike = _alike(one, fitted, found.state, screening, study)
+            found.causes.append(Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p))
+            found.state = fitted[one.name]
+            found.refused.pop(one.name, None)
+            gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
+            study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
+
+
+def _rivals(best: Candidate, standing: Sequence[Candidate], screening: Screening) -> list[Candidate]:
+    """Those that promise about as much as the best, and change much the same."""
+    return [
+        one
+        for one in standing
+        if one is not best
+        and one.gain_nm2 >= RIVAL_SHARE * best.gain_nm2
+        and abs(screening.cosine(best, one)) >= RIVAL_COSINE
+    ][:RIVALS]
+
+
+def _alike(
+    one: Candidate, fitted: Mapping[str, State], before: State, screening: Screening, study: Study
+) -> tuple[str, ...]:
+    """What these scans cannot tell from it: by fits where there are, by what is screened elsewhere."""
+    own = fitted[one.name]
+    by_fit = [
+        name
+        for name, other in sorted(fitted.items(), key=lambda pair: pair[1].mse_nm2)
+        if name != one.name
+        and same_change(before, own, other)
+        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, study)
+    ]
+    by_screening = [
+        other.name
+        for other in screening.candidates
+        if other.by == one.by
+        and other.name not in fitted
+        and other.allowed
+        and other.gain_nm2 >= 0.5 * one.gain_nm2
+        and abs(screening.cosine(one, other)) >= SAME_COSINE
+    ]
+    return (*by_fit, *by_screening)
 
 
 def _standing(screening: Screening, found: Found) -> list[Candidate]:
@@ -203,7 +222,7 @@ def _defend(found: Found, study: Study) -> None:
         return
     for cause in list(found.causes):
         study.report(f"deciding once more on {cause.name}")
-        without = fit_state(found.state.twin.without(cause.name), study)
+        without = found.state.without(cause.name, study)
         judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
         at = found.causes.index(cause)
         if judgement.passed(grouped=cause.by != ALL):

@@ -57,12 +57,13 @@ from benchmarks.blind_trials.scoreboard import (
     as_markdown,
     figures_of,
     make_scoreboard,
-    publish,
-    published,
+    mark_of,
+    publish_scoreboard,
     share,
     trial_table,
 )
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
+from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
 from litho_data.store import PrintedScan, open_store
@@ -279,7 +280,7 @@ def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
     draw = drawn(cause("dose-exponent"), kind="alias")
     (planted,) = plant(draw, trial_jobs(draw, 4, 96))
     assert not planted.at_limit
-    # docs/virtual_fab.md: a refit leaves 6 % of it.
+    # A refit of the plain model leaves 6 % of it.
     assert planted.rms_nm < 0.2 * 12.0
 
 
@@ -535,27 +536,27 @@ def test_the_scoreboard_survives_its_file_and_its_page_says_what_it_says(tmp_pat
     other = scoreboard.model_copy(update={"seed": 7})
     page = tmp_path / "page.md"
     page.write_text(page_of(scoreboard, "old") + page_of(other, "another board"), encoding="utf-8")
-    publish(page, scoreboard)
-    assert published(page, scoreboard) == as_markdown(scoreboard)
-    assert published(page, other) == "another board"
+    publish_scoreboard(page, scoreboard)
+    assert published(page, mark_of(scoreboard)) == as_markdown(scoreboard)
+    assert published(page, mark_of(other)) == "another board"
     assert page.read_text(encoding="utf-8").startswith("top\n")
     assert page.read_text(encoding="utf-8").endswith("\nbottom\n")
     table = trial_table(scoreboard)
     assert table.name.tolist()[:4] == ["vignetting", "far-copy", "linear-slope-loss", "galvo-lag"]
     assert len(table) == 8
     with pytest.raises(InputError, match="pending"):
-        publish(page, make_scoreboard(draws, trials[:-1], ""))
+        publish_scoreboard(page, make_scoreboard(draws, trials[:-1], ""))
 
 
 def page_of(scoreboard: Scoreboard, text: str) -> str:
-    start = f"<!-- board of {scoreboard.board} {scoreboard.seed}: written by the command -->"
-    return f"top\n{start}\n{text}\n<!-- end of scoreboard -->\nbottom\n"
+    mark = mark_of(scoreboard)
+    return f"top\n<!-- {mark}: written by the benchmark -->\n{text}\n<!-- end of {mark} -->\nbottom\n"
 
 
 def test_the_published_table_is_the_committed_scoreboard():
     for file in RESULTS.glob("*/scoreboard.json"):
         scoreboard = Scoreboard.read(file)
-        assert published(PAGE, scoreboard) == as_markdown(scoreboard)
+        assert published(PAGE, mark_of(scoreboard)) == as_markdown(scoreboard)
         assert scoreboard.trials
     text = PAGE.read_text(encoding="utf-8")
     table = text.split("<!-- earlier boards -->")[1].split("<!-- end of earlier boards -->")[0].strip()

@@ -32,9 +32,9 @@ from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop import LoopConfig
-from litho_models.loop.folded_base import train_folds
+from litho_models.twin.folded_base import train_folds
 from litho_models.loop.nested import nest
-from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
+from litho_models.twin.prepared import by_name, prepare_scans, prepared_again
 from litho_models.loop.run import _trainer
 from litho_models.loop.selection.contest import _fitted
 from litho_models.loop.study import Study, deal, fit_state

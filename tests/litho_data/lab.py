@@ -14,6 +14,8 @@ PITCH_UM = 0.15
 LEVEL_HEIGHT_UM = 0.08
 LEVELS = 13
 MARGIN_PX = 20
+# Of bare substrate around a field that is alone.
+RIM_PX = 2
 JITTER_UM = 0.006
 SIDE_PX = 160
 MIRRORED = "B2"
@@ -109,7 +111,8 @@ def errors_nm(store: object) -> dict[str, float]:
     found = {}
     for scan in store.scans():  # type: ignore[attr-defined]
         inner = slice(2 * MARGIN_PX, -2 * MARGIN_PX)
-        truth = print_of(scan.id, scan.shape[0])[inner, inner]
-        off = (scan.height_um - truth)[scan.valid]
+        truth = print_of(scan.id, scan.shape[0] - 2 * RIM_PX)[inner, inner]
+        field = (slice(RIM_PX, -RIM_PX),) * 2
+        off = (scan.height_um[field] - truth)[scan.valid[field]]
         found[scan.id] = float(np.abs(off - np.median(off)).mean() * 1e3)
     return found

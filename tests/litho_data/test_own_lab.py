@@ -17,7 +17,7 @@ from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe
 from litho_data.store import open_store
-from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, errors_nm, write_lab
+from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, RIM_PX, errors_nm, write_lab
 
 BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
 # The median of |6 nm jitter of the lines| + noise is 4.8 nm; 8 leaves room for what levelling gets wrong.
@@ -57,6 +57,12 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert f"check {MIRRORED}: a mirror image" in build.stderr
     scan = store.scan("B3")
     assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
+    # Around it models see the substrate, and its measured heights stand where the scan has them.
+    rim = np.ones(scan.shape, bool)
+    rim[RIM_PX:-RIM_PX, RIM_PX:-RIM_PX] = False
+    assert not scan.mask_level[rim].any()
+    assert scan.mask_level[~rim].any(axis=None)
+    assert scan.valid[rim].mean() > 0.9
 
 
 def other_unit(card: Path) -> None:

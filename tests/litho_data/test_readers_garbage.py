@@ -14,7 +14,6 @@ import tifffile
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.readers import SIGNATURES
 from litho_data.foundation.errors import InputError
 from litho_data.readers import formats, list_channels, read_layout, read_scan
 from litho_data.readers.tiff import _ome_pitch_um as ome_pitch_um
@@ -22,7 +21,11 @@ from tests.litho_data import afm_files
 
 LONGEST_S = 20
 STARTS = (
-    *SIGNATURES, b"DSCOMPRESSED", b":NANONIS_VERSION:\n2\n:SCANIT_END:\n", b"DSAA\n3 3\n", b"DSBB\3\0\3\0",
+    b"Gwyddion Simple Field 1.0\n", b"GWYPGwyContainer\0", b"\x93NUMPY\x01\x00", b"II*\0\x08\0\0\0", b"MM\0*",
+    b"II+\0", b"\x89PNG\r\n\x1a\n", b"BM", b"\x05\x00", b"\x00\x05", b"DIGITAL SURF\0", b"\\*File list\r\n",
+    b"PK\x03\x04", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"MATLAB 5.0 MAT-file", b"WSxM file copyright",
+    b"1 2 3\n", b"# Width: 1 um\n",
+    b"DSCOMPRESSED", b":NANONIS_VERSION:\n2\n:SCANIT_END:\n", b"DSAA\n3 3\n", b"DSBB\3\0\3\0",
     b"DSRB\1\0\0\0", b"Wyko ASCII Data File Format\t0\t1\t1\nX Size\t3\n", b"MATLAB 7.3 MAT-file",
 )  # fmt: skip
 

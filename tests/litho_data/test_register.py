@@ -7,7 +7,10 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from benchmarks.register_phantoms import (
+from litho_data.foundation.errors import InputError
+from litho_data.register import Registration, apply_transform, centred_placement, register_scan
+from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
+from tests.litho_data.register_phantoms import (
     PITCH_UM,
     random_layout,
     scan_of,
@@ -15,9 +18,6 @@ from benchmarks.register_phantoms import (
     warp_about_centre,
     warp_error_px,
 )
-from litho_data.foundation.errors import InputError
-from litho_data.register import Registration, apply_transform, centred_placement, register_scan
-from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
 
 SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
 MARGIN_PX = (39.0, 35.0)

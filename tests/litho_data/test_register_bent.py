@@ -8,13 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from benchmarks.register_phantoms import (
-    LEVEL_HEIGHT_UM,
-    PITCH_UM,
-    PRINT_BLUR_PX,
-    random_layout,
-    warp_about_centre,
-)
 from litho_data.build.build import build_dataset
 from litho_data.exchange.release import export_zip
 from litho_data.level import layout_in_scan_frame
@@ -30,6 +23,13 @@ from litho_data.virtual_fab import KnobSetting, Truth, simulate
 from litho_data.virtual_fab.canvas import GUARD_PX
 from litho_data.virtual_fab.geometry import ScanFrame, sample_surface
 from litho_data.virtual_fab.knobs import KnobBoard
+from tests.litho_data.register_phantoms import (
+    LEVEL_HEIGHT_UM,
+    PITCH_UM,
+    PRINT_BLUR_PX,
+    random_layout,
+    warp_about_centre,
+)
 
 SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
 AMOUNT_UM = np.array([[0.66, -0.45, 0.54], [-0.6, 0.72, 0.39]])

@@ -8,16 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from benchmarks.register_phantoms import PITCH_UM, scan_of, true_scan_to_layout
-from benchmarks.registration import (
-    DEFECTS,
-    SCAN_SHAPE,
-    SHAPE,
-    creeping,
-    print_of,
-    register,
-    rms_error_px,
-)
 from litho_data.build.build import build_dataset
 from litho_data.provenance.history import replay
 from litho_data.provenance.verify import verify
@@ -26,6 +16,18 @@ from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.geometry import index_to_um
 from litho_data.store import open_store
 from tests.litho_data.campaigns import height_of, layout_of, write_campaign, write_scan
+from tests.litho_data.register_phantoms import (
+    DEFECTS,
+    PITCH_UM,
+    SCAN_SHAPE,
+    SHAPE,
+    creeping,
+    print_of,
+    register,
+    rms_error_px,
+    scan_of,
+    true_scan_to_layout,
+)
 
 
 @pytest.mark.parametrize("name", DEFECTS)

@@ -11,7 +11,6 @@ import pytest
 import scipy.ndimage
 from typer.testing import CliRunner
 
-from benchmarks.tip import OVER, PITCH_UM, fine_surface, noise_of_snr, print_under_tip
 from litho_data.build.build import build_dataset
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
@@ -34,6 +33,7 @@ from litho_data.tip import (
 )
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 from tests.litho_data.campaigns import write_campaign
+from tests.litho_data.known_tips import OVER, PITCH_UM, fine_surface, noise_of_snr, print_under_tip
 
 PITCH = PITCH_UM
 _image = cache(lambda kind, radius_um: print_under_tip(kind, radius_um, 1.0))
@@ -104,7 +104,6 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
     assert found.radius_um == pytest.approx(radius_um, rel=0.1)
     assert found.radius_sd_um is not None
     assert abs(found.radius_um - radius_um) < 3 * found.radius_sd_um
-    # What the benchmark measures is what the command says.
     assert peak_radius(_scan(kind, radius_um, snr).height_um, PITCH).radius_um == found.radius_um
 
 

@@ -12,7 +12,6 @@ import pytest
 import tifffile
 from PIL import Image
 
-from benchmarks import stl_files as benchmark
 from litho_data.foundation.errors import InputError
 from litho_design.elements.element import Element
 from litho_design.exports import marks
@@ -28,7 +27,6 @@ from litho_design.printers.layout import LayoutSettings, printability
 from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram
-from tests.quoted import require_quoted
 
 POWERS = tuple(range(50, 63))
 FORMATS = ["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
@@ -200,37 +198,6 @@ def test_stl_is_watertight_where_columns_touch_at_corners(tmp_path, seed):
         _require_closed(corners)
     assert _volume(np.array(corners)) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=3e-4)
     assert np.array_equal(read_stl_levels(file, levels.shape, 0.4, 0.1, 1.0), levels)
-
-
-def test_the_benchmark_counts_corners_and_believes_no_open_surface(tmp_path, monkeypatch):
-    """Closed forms of the count; the figures of a file come from parsers that are not ours."""
-    # A block has eight corners, n steps 4 n + 4; cells of the same level are one face.
-    assert benchmark.corners(np.zeros((3, 5), int)) == 8
-    for steps in (2, 7):
-        assert benchmark.corners(np.array([range(steps)] * 5)) == 4 * steps + 4
-    # Four different levels at one point end at four corners; on each side are two ends of the step, of two
-    # corners each, at the corners of the block one each, and four below.
-    assert benchmark.corners(np.array([[1, 2], [3, 4]])) == 4 + 4 * 2 + 4 + 4
-    levels = np.random.default_rng(0).integers(0, 4, (9, 7))
-    triangles = write_stl(tmp_path / "f.stl", levels.astype(np.uint8), 0.4, 0.1, 1.0)
-    assert 0 <= triangles - (2 * benchmark.corners(levels) - 4) < 0.1 * triangles
-    pytest.importorskip("trimesh")
-    pytest.importorskip("stl")
-    settings = benchmark.hologram_settings()
-    found = benchmark.measured(levels.astype(np.uint8), settings)
-    assert benchmark.closed(found)
-    assert found["trimesh_volume_off"] < 1e-3
-    records = (tmp_path / "f.stl").read_bytes()
-
-    def one_triangle_less(path, *words):
-        path.write_bytes(records[:80] + struct.pack("<I", triangles - 1) + records[84:-50])
-
-    monkeypatch.setattr(benchmark, "write_stl", one_triangle_less)
-    assert not benchmark.closed(benchmark.measured(levels.astype(np.uint8), settings))
-
-
-def test_the_page_quotes_the_files_that_were_read():
-    require_quoted(benchmark)
 
 
 def _require_closed(corners) -> None:

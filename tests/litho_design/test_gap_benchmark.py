@@ -10,25 +10,19 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from benchmarks.gap import paper_search
-from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
-from benchmarks.gap.paper_picture import search_figure
-from benchmarks.gap.paper_tables import FAB, MEASURED, NAMES
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
-from benchmarks.record import NOT_MEASURED, published
+from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
 from litho_design.cli.app import app
-from litho_design.judging.gap import GapEntry, paired_differences, summarise
-from litho_design.lenses.settings import lens_settings
 from litho_models import save_frozen
 from litho_models.models import build_model
 
@@ -117,27 +111,6 @@ def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
         run_commands([job("silent", "")], tmp_path / "logs")
 
 
-def test_a_trial_times_all_that_a_design_does(tmp_path):
-    (task,) = (one for one in tasks(tmp_path, TINY, {}, None) if one.name == "hoe")
-    run_trial(tmp_path, task, "none")
-    record = read_records(tmp_path)["hoe", "none"]
-    assert 0 < record["score_s"] < record["beside_s"]
-    assert min(record["iteration_s"], record["evaluation_s"], record["print_s"]) > 0
-
-
-def test_the_estimate_adds_up(tmp_path):
-    planned = [task for task in tasks(tmp_path, Effort(), {}, None) if task.name == "lens-direct"]
-    cost = {"iteration_s": 2.0, "evaluation_s": 1.0, "print_s": 3.0, "peak_gib": 1.0}
-    cost |= {"beside_s": 30.0, "score_s": 4.0}
-    records = dict.fromkeys([("direct", arm) for arm in ARMS], cost)
-    rows = estimate(records, planned, Effort())
-    # Search and polish, evaluations, what is beside it; a print by each arm, a score by each and the fab.
-    prints, scores = len(ARMS), len(ARMS) + 1
-    n, seeds = planned[0].iterations, planned[0].seeds
-    expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + prints * 3.0 + scores * 4.0) / 60
-    assert [row["minutes"] for row in rows[1:]] == pytest.approx([expected] * len(ARMS))
-
-
 def test_the_model_of_a_closed_loop_is_an_arm_of_the_measured_task_only(tmp_path):
     zoo = {name: f"zoo/{name}" for name in ("physics", "fno", "pbl")}
     *others, measured = tasks(tmp_path, TINY, zoo, "loop/model")
@@ -189,87 +162,3 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
 def test_the_page_quotes_the_committed_comparison():
     record = json.loads((RESULTS / RESULT_FILE).read_text("utf-8"))
     assert published(PAGE, NAME) == as_markdown(record)
-
-
-def test_the_papers_search_and_ours_get_the_same_iterations_arms_and_judges(tmp_path):
-    found = {task.name: task for task in paper_search.paper_tasks(tmp_path, TINY)}
-    assert len(found) == 12
-    for name, task in found.items():
-        kind, search, iterations = name.rsplit("-", 2)
-        other = found[f"{kind}-{'ours' if search == 'paper' else 'paper'}-{iterations}"]
-        assert (task.models, task.judges, task.seeds) == (other.models, other.judges, other.seeds)
-        assert task.iterations == int(iterations)
-        assert ("--variant" in task.options) == (search == "paper")
-        if kind != "hoe":
-            # Both see as much of the focal plane.
-            view = paper_search.SAME_VIEW[kind.removeprefix("lens-")]
-            assert "--window-px" in view
-            assert task.options[-len(view) :] == view
-        if kind == "lens-computational":
-            preset, given = lens_settings("computational", "paper"), " ".join(task.options)
-            assert f"imaging.pixel_px={preset.imaging.pixel_px}" in given
-            assert f"--object-px {preset.imaging.object_px}" in given
-            assert f"--window-px {preset.view.window_px}" in given
-        # A third of the iterations three times costs what all of them cost once.
-        assert task.iterations * task.seeds == pytest.approx(1000, rel=2e-3)
-
-
-def test_the_table_of_the_papers_search_says_what_is_not_made_and_who_leads(tmp_path):
-    task = next(
-        task for task in paper_search.paper_tasks(tmp_path, TINY) if task.name == "lens-direct-paper-333"
-    )
-    entries = [
-        GapEntry(
-            arm=arm, seed=seed, judge=judge, self_judged=False, rms_height_gap_um=0.0,
-            designed={"cbr": 100.0}, judged={"cbr": 50.0 + seed + (20 if arm == "physics" else 0)},
-        )
-        for arm in task.models for judge in task.judges for seed in range(task.seeds)
-    ]  # fmt: skip
-    done = {
-        "iterations": 333,
-        "seeds": 3,
-        "minutes": {"none": 1.2},
-        "large_jump_share": {"none": 0.041, "physics": 0.013},
-        "height_gap_nm": {"fab": {"none": 274.2, "physics": 141.9}},
-        "summary": [item.model_dump() for item in summarise(entries)],
-        "paired": [item.model_dump() for item in paired_differences(entries, ["cbr"])],
-    }
-    text = paper_search.as_markdown({"tasks": {task.name: done}})
-    # Student's t of three seeds one apart: 4.30 · 1 / √3 = 2.5. The pairs differ by the same each time.
-    assert "| none | fab | not made yet | not made yet | 100 → 51 ± 2 | not made yet |" in text
-    assert "paper 333: none 1." in text
-    assert "those expected, rms: paper 333: none 4.1 % and 274 nm, physics 1.3 % and 142 nm." in text
-    # A task that has not been judged by all yet.
-    fab = [item for item in done["summary"] if item["judge"] == "fab"]
-    both = {task.name: done, "lens-direct-ours-333": {**done, "summary": fab}}
-    assert "| 100 → 51 ± 2 | not made yet |" in paper_search.as_markdown({"tasks": both})
-    lead = "physics is best in centre-to-background ratio. Its lead: over none +20 [+20, +20]"
-    assert f"paper, 333: Printed by fab, {lead}; over fno" in text
-    # Of the many measured printers the next arm only.
-    assert f"paper, 333: Printed by measured-pbl, {lead}.\n" in text
-
-
-def test_the_picture_of_the_papers_search_shows_every_seed():
-    tasks = json.loads((RESULTS / paper_search.FILE_NAME).read_text("utf-8"))["tasks"]
-    panels = [(name, judge) for name in NAMES.values() for judge in (FAB, *MEASURED)]
-    axes = search_figure({"tasks": tasks}).axes
-    assert len(axes) == len(panels)
-    for (name, judge), panel in zip(panels, axes, strict=True):
-        runs = [
-            run
-            for task, made in tasks.items() if task.startswith(f"{name}-")
-            for run in made["of_each_seed"] if run["judge"] == judge
-        ]  # fmt: skip
-        # Two searches, each with three seeds and one, through four arms.
-        assert len(runs) == 2 * (3 + 1) * 4
-        shown = {float(x) for line in panel.lines for x in line.get_xdata()}
-        assert shown == {run[when] for run in runs for when in ("designed", "judged")}
-    lenses = {task: made for task, made in tasks.items() if task.startswith("lens-direct-paper")}
-    assert len(search_figure({"tasks": lenses}).axes) == 1 + len(MEASURED)
-
-
-def test_the_page_quotes_the_papers_search():
-    text = published(PAGE, paper_search.NAME)
-    file = RESULTS / paper_search.FILE_NAME
-    record = json.loads(file.read_text("utf-8")) if file.exists() else None
-    assert text == (NOT_MEASURED if record is None else paper_search.as_markdown(record))

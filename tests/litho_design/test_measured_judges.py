@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from benchmarks import photographs
-from benchmarks.photographs import Camera
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
@@ -24,7 +22,46 @@ from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
-from tests.quoted import require_quoted
+
+DARK, WHITE, RANGE = 8000.0, 40000.0, 65535
+_FINER = 4
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera: how it stands, and what it does to the light."""
+
+    pitch_um: float = 0.15
+    turn_deg: float = 0.0
+    shift_um: tuple[float, float] = (0.0, 0.0)
+    scale: float = 1.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    vignetting: float = 0.0
+    noise: float = 0.0
+    exposure: float = 1.0
+    gamma: float = 1.0
+
+    def counts(self, light: np.ndarray, pitch_um: float, seed: int) -> np.ndarray:
+        """The photograph uint16 of light (n, n) on pixels of ``pitch_um``."""
+        step = self.pitch_um / pitch_um / self.scale
+        side = round(1.15 * len(light) / step)
+        place = (np.arange(side * _FINER) + 0.5) / _FINER - side / 2
+        across = 1 + 2 / side * (self.tilt[0] * place[None] + self.tilt[1] * place[:, None])
+        turn, middle = step * np.exp(1j * np.deg2rad(self.turn_deg)), (len(light) - 1) / 2
+        seen_at = turn * (place[None] + 1j * place[:, None]) / across + complex(*self.shift_um) / pitch_um
+        fine = cv2.remap(
+            light.astype(np.float32),
+            (seen_at.real + middle).astype(np.float32),
+            (seen_at.imag + middle).astype(np.float32),
+            cv2.INTER_CUBIC,
+        )
+        seen: np.ndarray = fine.clip(0).reshape(side, _FINER, side, _FINER).mean((1, 3))
+        edge = np.square(np.linspace(-1, 1, side))
+        seen *= (1 - self.vignetting * (edge[:, None] + edge) / 2) / seen.max()
+        seen += np.random.default_rng(seed).normal(0, self.noise, seen.shape)
+        bent = seen if self.gamma == 1 else seen.clip(0) ** self.gamma
+        counts = WHITE * self.exposure * bent + DARK
+        return counts.round().clip(0, RANGE).astype(np.uint16)
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +213,7 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     light = cv2.GaussianBlur(loaded.image(0.95 * loaded.expected_um), (0, 0), 1.0)
     truth = si_psnr_db(torch.from_numpy(light).double(), loaded.target.double())
 
-    def scored(dark=photographs.DARK, **camera):
+    def scored(dark=DARK, **camera):
         counts = Camera(**camera).counts(light, 0.1, seed=0)
         cv2.imwrite(str(tmp_path / "p.png"), counts)
         pitch_sd = 0.05 if "scale" in camera else 0.0
@@ -225,10 +262,6 @@ def test_figures_are_freed_of_what_noise_adds_on_average():
     assert np.mean(drawn) - wanted == pytest.approx(sd**2, abs=4e-3)
     assert np.mean(freed) == pytest.approx(wanted, abs=4e-3)
     assert spread["mean"] == pytest.approx(sd / np.sqrt(4000), rel=0.8)
-
-
-def test_the_page_quotes_the_photographs_that_were_scored():
-    require_quoted(photographs)
 
 
 def test_baselines_stand_beside_every_score(printed_design, tmp_path):

@@ -11,7 +11,6 @@ import pytest
 import tifffile
 import torch
 
-from benchmarks import relief as benchmark
 from litho_data.foundation.errors import InputError
 from litho_design import correct, load_design
 from litho_design.cli.app import main
@@ -21,7 +20,6 @@ from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
 from litho_design.reliefs.task import ReliefTask
 from litho_design.reports.advice import width_sentence
-from tests.quoted import require_quoted
 
 TINY = {
     "layout.size_px": 48,
@@ -203,21 +201,3 @@ def test_reliefs_are_read_in_micrometres(tmp_path):
         load_relief("hill", layout, 0.5)
     with pytest.raises(InputError, match="equal"):
         load_relief(np.zeros((48, 48)), layout, 0.5)
-
-
-def test_the_benchmark_gives_each_arm_the_error_of_its_own_print():
-    """A printer of gain 0.8 and any zero: 1.25 is all that it takes, nominal heights are 20 % low."""
-    settings = relief_settings({"layout.size_px": 48, "height_um": 0.8})
-    wanted_um = np.repeat(0.4 * (np.arange(48) // 16), 48).reshape(48, 48).astype(np.float32)
-    corrected = np.zeros((48, 48), np.uint8)
-    found = benchmark.errors_nm(
-        lambda nominal_um, pitch_um: 0.8 * nominal_um + 0.3, wanted_um, corrected, settings
-    )
-    assert found["uncorrected_nm"] == pytest.approx(0.2 * 1e3 * wanted_um.std(), rel=1e-5)
-    assert found["corrected_nm"] == pytest.approx(1e3 * wanted_um.std(), rel=1e-6)
-    # Five levels where four are nominal, by any gain that rounds to them; float32 is exact to 1e-4 nm.
-    assert found["affine_nm"] == pytest.approx(0, abs=1e-3)
-
-
-def test_the_page_quotes_the_committed_measurement():
-    require_quoted(benchmark)

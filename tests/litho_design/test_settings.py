@@ -104,7 +104,7 @@ def test_no_two_settings_share_an_option(task):
 def test_help_shows_default_and_unit_of_every_option(command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERMINAL_WIDTH", "200")
-    shown = CliRunner().invoke(app, [command, "--help"]).stdout
+    shown = CliRunner().invoke(app, [command, "--help-all"]).stdout
     presets = [PRESETS["hoe"], PRESETS["lens"]] if command == "compare" else [PRESETS[command]]
     offered = options_of(command)
     for leaf in (leaf for preset in presets for leaf in leaves(preset) if offered & set(leaf.options)):

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.models import build_model
 
 LEVELS, LEVEL_HEIGHT_UM, PITCH_UM = 13, 0.1, 0.1

@@ -70,7 +70,11 @@ def write_store(path: Path, scans: Sequence[PrintedScan], **attributes: float) -
             "print": ("scan", [scan.print_id for scan in scans]),
             "order": ("scan", [scan.order for scan in scans]),
             "y_um": ("y", (np.arange(first.shape[0]) + 0.5) * first.pitch_um),
-            **({"dose": ("scan", [scan.dose for scan in scans])} if first.dose is not None else {}),
+            **{
+                name: ("scan", [getattr(scan, name) for scan in scans])
+                for name in ("dose", "turned_deg")
+                if getattr(first, name) is not None
+            },
             "x_um": ("x", (np.arange(first.shape[1]) + 0.5) * first.pitch_um),
         },
         attrs={

@@ -21,14 +21,14 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
-from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.result.questions import Question
 from litho_models.planning.layouts import Limits, score
+from litho_models.planning.questions import Question
 from litho_models.planning.rivalry import Printing, Rivalry, Way
-from tests.litho_models.loop_scans import printed_scans, true_model
+from litho_models.twin.prepared import prepare_scans
 from tests.litho_models.test_next_print import first_layout, opened, rival, white
+from tests.litho_models.twin_scans import base_model, blank_scans
 
-FINE = Way(fine=True)
+FINE = Way(pixel_size=0.5)
 
 
 @pytest.mark.parametrize("pixel_size", [1.0, 0.5])
@@ -82,9 +82,9 @@ def test_smaller_pixels_tell_a_blur_of_the_resist_from_one_of_the_scan() -> None
         kind="set",
         text="which of two",
         experiment="smaller pixels",
-        rivals=[rival(name, {name: values}, []) for name, values in blurs.items()],
+        rivals=[rival(name, {name: values}) for name, values in blurs.items()],
     )
-    rivalry = Rivalry(question, true_model({}).base, Printing(0.1, 0.1, 12), white())
+    rivalry = Rivalry(question, base_model(), Printing(0.1, 0.1, 12), white())
     level = first_layout(Limits.of(opened([]), 0.1))
     ways = (Way(),), (Way(), Way(turned_deg=90)), (Way(), FINE)
     plain, twice, fine = (score(rivalry, level, one) for one in ways)
@@ -105,7 +105,7 @@ def test_the_pixels_of_a_scan_go_from_the_table_to_the_loop(tmp_path: Path) -> N
     store = open_store(tmp_path / "store.zarr")
     assert [scan.pixel_size for scan in store.scans()] == [1.0, 0.5]
     assert [scan.context.pixel_size for scan in prepare_scans(store.scans())] == [1.0, 0.5]
-    assert prepare_scans(printed_scans(size_px=64, count=1))[0].context.pixel_size == 1.0
+    assert prepare_scans(blank_scans(1))[0].context.pixel_size == 1.0
 
 
 def test_pixels_without_a_size_are_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.loop.single_scans.line_period import period_of_lines
 from tests.litho_models.loop_scans import printed_scans
 

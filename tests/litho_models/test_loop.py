@@ -32,7 +32,7 @@ from litho_models.loop import (
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import TERM_WEIGHT, fit_folds, predict
 from litho_models.loop.parameters import at_bounds, chain_at, effect_slots, get_vector, room
-from litho_models.loop.prepared import LARGE_PX, prepare_scans
+from litho_models.twin.prepared import LARGE_PX, prepare_scans
 from litho_models.loop.report.page import write_report
 from litho_models.loop.report.wording import error_lines, plain_words, verdict_text
 from litho_models.loop.result.exporting import exported_effects

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from litho_models.effects import FieldContext, get_effect
 from litho_models.loop import LoopConfig, close_loop
 from litho_models.loop.fold_fits import FoldFits
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.screening.directions import blocks_of
 from litho_models.loop.selection.rivals import generic_rival, remainder_of
 from litho_models.loop.study import State, Study

@@ -14,7 +14,7 @@ from litho_models.loop import LoopConfig, close_loop, nested
 from litho_models.loop.choice import Choice
 from litho_models.loop.gain_split import GainStep, split_gain
 from litho_models.loop.nested import Nested, nest
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.probes.selection import with_generic_terms
 from litho_models.loop.selection.search import EffectSets, Search
 from litho_models.loop.study import DATUM_FREE, Study, deal, fit_state

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop import explainable
-from litho_models.loop.explainable import Learner, Rest
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.learner import Learner, Rest
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.loop.study import Study
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import printed_scans, true_model

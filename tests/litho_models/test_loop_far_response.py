@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import selection, with_intervals
 from litho_models.loop.probes.far import DIRECTIONS, LENGTHS_UM, _columns, far_response, in_words, summary
 from litho_models.loop.probes.linear import Left, LinearProbe

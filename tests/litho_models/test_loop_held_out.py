@@ -11,7 +11,7 @@ import pytest
 from litho_models.effects import get_effect
 from litho_models.loop.fold_fits import FoldFits, predict
 from litho_models.loop.parameters import get_vector
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.selection import contest
 from litho_models.loop.selection import search as selection
 from litho_models.loop.study import State, Study, held_out_residuals

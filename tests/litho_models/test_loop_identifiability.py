@@ -10,7 +10,7 @@ from litho_models.fitting.least_squares import eliminated
 from litho_models.loop.fold_fits import TERM_WEIGHT
 from litho_models.loop.identifiability import PROFILE_POINTS, identifiability, profiles
 from litho_models.loop.parameters import effect_slots, get_vector
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.study import Study, fit_state
 from tests.litho_models.loop_scans import printed_scans, true_model
 

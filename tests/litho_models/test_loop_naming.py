@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.selection.confirming import confirm
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import FORM_ERROR, Search, rejection_reason

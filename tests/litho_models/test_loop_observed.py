@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from litho_data.register.bend import Bend
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.single_scans.observed import (
     bends,

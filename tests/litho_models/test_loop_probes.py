@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from litho_models.loop.fold_fits import FoldFits
 from litho_models.loop.linear import ALL_FREE
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import missing_kernel, off_centre_peak, resampled

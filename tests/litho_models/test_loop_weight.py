@@ -10,9 +10,9 @@ import pytest
 
 from litho_models.effects import get_effect
 from litho_models.loop import close_loop
-from litho_models.loop.explainable import Learner
+from litho_models.twin.learner import Learner
 from litho_models.loop.linear import ALL_FREE
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.loop.screening.directions import PROJECTIONS
 from litho_models.loop.selection.weight import Weight, left_beside_names_nm2, weigh
 from litho_models.loop.study import Study, fit_state

@@ -14,7 +14,7 @@ from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.fitting.pixel_weights import pixel_weights
 from litho_models.loop.fold_fits import fit_folds, predict
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.models import build_model
 from tests.litho_models.prints import make_scans
 

@@ -16,13 +16,14 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.prepared import prepare_scans
 from litho_models.planning import designer
-from litho_models.planning.designer import SECOND_DOSE, as_tensor
+from litho_models.planning.designer import SECOND_DOSE
+from litho_models.planning.layouts import as_tensor
 from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 from litho_models.planning.run import next_print
-from tests.litho_models.loop_scans import printed_scans, true_model
+from litho_models.twin.prepared import prepare_scans
 from tests.litho_models.test_next_print import closed_loop, slope_question
+from tests.litho_models.twin_scans import base_model, blank_scans
 
 PLAIN = (Way(),)
 
@@ -62,13 +63,14 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
 
 
 def test_plan_and_loop_see_a_dose_as_the_fab_does() -> None:
-    chain, printing = true_model({}), Printing(0.1, 0.1, 12)
+    chain = EffectChain(base_model(), {}, full_height_um=1.2, pitch_um=0.1)
+    printing = Printing(0.1, 0.1, 12)
     level = as_tensor(_even_levels())
     with torch.no_grad():
         at_half = printing.predict(chain, PlannedPrint(level, PLAIN, dose=0.5), Way())
         half = printing.predict(chain, PlannedPrint(level / 2, PLAIN), Way())
     assert torch.allclose(at_half, half, atol=1e-6)
-    scan = printed_scans(size_px=64, count=1)[0]
+    scan = blank_scans(1)[0]
     usual, weak, untold = (prepare_scans([replace(scan, dose=dose)])[0] for dose in (1.0, 0.8, None))
     assert torch.equal(usual.layout, untold.layout)
     assert torch.allclose(weak.layout, 0.8 * usual.layout)

@@ -72,6 +72,14 @@ def test_a_group_behind_which_there_is_no_scan_has_the_mean_of_the_others(twin: 
     assert twin.known_from([]).values({"field": "1"})[THINNING]["along_x_um"] == 0.0
 
 
+def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> None:
+    plain = twin.ungrouped()
+    assert plain.values({"field": "1"}) == plain.values({}) == twin.values({})
+    assert plain.values({})[THINNING]["along_x_um"] == pytest.approx(0.15)
+    assert plain.vector == pytest.approx(np.r_[twin.vector[: twin.own], 0.15, 0.0, 1.0])
+    np.testing.assert_array_equal(plain.alone().vector, twin.vector[: twin.own])
+
+
 def test_directions_are_chosen_and_never_fitted(study) -> None:
     lag = {"length_um": 0.2, "direction": -1.0}
     twin = Twin.bare(base_model(), study.scans[0]).with_effect("galvo-lag", ALL, {"": lag})
@@ -144,7 +152,7 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
 def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
     start = {label: thinning(0.12, 1.2) for label in "12"}
     state = fit_state(bare_state(study).twin.with_effect(THINNING, "field", start), study)
-    sd = np.sqrt(np.diag(clustered_covariance(state, [scan.id for scan in study.scans])))
+    sd = np.sqrt(np.diag(clustered_covariance(state.linear, [scan.id for scan in study.scans])))
     wanted = [0.9, 0.03, 0.1, 0.2, 0.0, 0.0, 1.0]
     for at in (2, 3, 6):
         assert state.twin.vector[at] == pytest.approx(wanted[at], abs=5 * sd[at] + 0.01 * wanted[at])

@@ -18,12 +18,13 @@ from litho_data.store import open_store
 from litho_models.effects import get_effect
 from litho_models.frozen.files import load_frozen
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin import closing, run
+from litho_models.twin import bases, closing
 from litho_models.twin.closing import freed_scans
+from litho_models.twin.errors import REPORTED, error_rows
 from litho_models.twin.record import CloseLoop, Explained
 from litho_models.twin.report import effect_text, measurement_text, verdict_text
-from litho_models.twin.results import REPORTED, _verdict, clustered_covariance, error_rows
-from litho_models.twin.run import close_store, dealt
+from litho_models.twin.results import _verdict, clustered_covariance
+from litho_models.twin.run import close_loop, dealt
 from tests.litho_models.prints import make_scans, write_store
 from tests.litho_models.twin_scans import bare_state, blank_scan, planted, study_of, with_heights
 
@@ -60,7 +61,7 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
         patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
         patch.setattr(closing, "DESCRIPTIONS", {TABLE: get_effect(TABLE)})
-        result = close_store(store, out, base=BASE, open_lock_box=True, report=said.append)
+        result = close_loop(store, out, base=BASE, open_lock_box=True, report=said.append)
     return result, out, said
 
 
@@ -222,7 +223,7 @@ def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
         study = study_of(planted(seed=seed))
         state = bare_state(study)
         fitted.append(state.twin.vector[0])
-        sds.append(np.sqrt(clustered_covariance(state, [scan.id for scan in study.scans])[0, 0]))
+        sds.append(np.sqrt(clustered_covariance(state.linear, [scan.id for scan in study.scans])[0, 0]))
     # A spread of 12 draws is known to a fifth, twice that is allowed for.
     assert np.std(fitted, ddof=1) == pytest.approx(np.mean(sds), rel=0.45)
 
@@ -259,22 +260,27 @@ def test_folds_hold_every_scan_out_once() -> None:
     assert np.array_equal(fold_of, dealt(scans, 5, 0))
 
 
-def test_a_base_is_asked_for_by_name_or_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_base_is_asked_for_by_name_or_the_best_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scans = planted(count=4)
     study = replace(study_of(scans), scans=())
-    name, _, others = run._bases("affine", scans, study)
-    assert (name, others) == ("affine", {})
-    monkeypatch.setattr(run, "BASES", ("identity", "affine"))
-    name, _, others = run._bases(run.AUTO, scans, study)
-    assert (name, list(others)) == ("affine", ["identity"])
+
+    def chosen(base: str) -> tuple[str, list[str]]:
+        found = bases.choose_base(base, scans, study, steps=None, cache=tmp_path)
+        return found.name, [*found.others]
+
+    assert chosen("affine") == ("affine", [])
+    monkeypatch.setattr(bases, "_COMPETING", ("identity", "affine"))
+    assert chosen(bases.AUTO) == ("affine", ["identity"])
     with pytest.raises(InputError):
-        run._bases("nonsense", scans, study)
+        chosen("nonsense")
 
 
 def test_one_scan_is_too_few(tmp_path: Path) -> None:
     store = write_store(tmp_path / "one.zarr", make_scans(1, 64))
     with pytest.raises(InputError, match="at least 2"):
-        close_store(store, tmp_path / "out", base=BASE)
+        close_loop(store, tmp_path / "out", base=BASE)
     assert not (tmp_path / "out").exists()
 
 
@@ -285,7 +291,7 @@ def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(
     monkeypatch.setattr(closing, "DESCRIPTIONS", {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
     store = write_store(tmp_path / "few.zarr", make_scans(3, 64))
-    result = close_store(store, tmp_path / "out", base="affine")
+    result = close_loop(store, tmp_path / "out", base="affine")
     assert result.verdict == "too-few-scans"
     assert {row.held_out for row in result.errors} == {"scans"}
     assert result.groups.get(ALL) is None
@@ -294,7 +300,7 @@ def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(
 def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError):
-        close_store(store, tmp_path, base=BASE)
+        close_loop(store, tmp_path, base=BASE)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 

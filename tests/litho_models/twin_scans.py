@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.store import PrintedScan
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.models import build_model
 from litho_models.simulator import Simulator
 from litho_models.twin.fits import State, Study, fit_state

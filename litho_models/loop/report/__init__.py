@@ -1,1 +1,0 @@
-"""What the loop found, for people."""

@@ -1,1 +1,0 @@
-"""What the loop found, as a record."""

@@ -1,1 +1,0 @@
-"""Which effects the residual asks for: score tests at the null."""

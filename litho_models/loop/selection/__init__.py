@@ -1,1 +1,0 @@
-"""Which of the effects that stand out is taken: contests and confirmation."""

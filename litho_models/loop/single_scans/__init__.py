@@ -1,1 +1,0 @@
-"""What single scans add, tested and seen."""

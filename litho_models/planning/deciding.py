@@ -1,0 +1,237 @@
+"""What new prints decide: the questions of a first round, declared before the new scans are looked at.
+
+Every rival is fitted to all prints, old and new, and judged on the new ones alone: the difference of two
+squared errors, less what the form of the model may have made of it, against its standard deviation, from
+blocks of pixels and, as in the plan, from what prints differ by. Scans of one print share its roughness, so
+their blocks are added up before they count. A rival is excluded where another is better with p <= 0.005 and
+by 1 % of its squared error; a name is given where one is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import f as f_distribution
+from scipy.stats import f_oneway
+
+from litho_data.store import PrintedScan
+from litho_models.effects import get_effect
+from litho_models.effects.effect import Role
+from litho_models.planning.noise import left_nm
+from litho_models.planning.power import PRINT_SHARE, Z_DECIDED, surely_better
+from litho_models.planning.questions import OpenQuestions, Owner, Question
+from litho_models.planning.rival_fits import fit_rivals
+from litho_models.scan_terms import freed_um, terms_of_effect
+from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
+from litho_models.scan_terms.term import row_index
+from litho_models.twin.closing import Closed
+from litho_models.twin.fits import Study
+from litho_models.twin.judging import CONFIRM_P, SMALLEST_SHARE
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan, prepare_scans
+from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision
+from litho_models.twin.single_scans import SingleScans
+
+NONE: Decided = "none of them"
+UNSEEN: Decided = "not shown by these prints"
+BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
+_ROLES: dict[Owner | None, Role] = {"printer": "process", "microscope": "measurement"}
+_BLOCK_PX = 32
+
+
+def decide(
+    closed: Closed,
+    open_: OpenQuestions,
+    new: Sequence[PrintedScan],
+    report: Callable[[str], None] = lambda message: None,
+) -> list[Decision]:
+    """Judge every declared question that scans can answer.
+
+    Args:
+        closed: the loop that asked; ``new``: scans that it has not seen.
+    """
+    judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
+    kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
+    decisions = []
+    for question in open_.questions:
+        if question.kind != "fact":
+            report(f"deciding on {question.name}")
+            decisions.append(kinds.get(question.kind, judge.among_rivals)(question))
+    return decisions
+
+
+@dataclass(frozen=True)
+class Judge:
+    """New scans, beside those that a model is known from.
+
+    Attributes:
+        twin: the corrected model, of one strength for all scans; ``study``: what it was fitted to.
+        new: scans that were in no fit so far.
+    """
+
+    twin: Twin
+    study: Study
+    new: Sequence[PreparedScan]
+
+    def among_rivals(self, question: Question) -> Decision:
+        """Rivals, and none of them, fitted to all scans and judged on the new ones."""
+        twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
+        without = twins[0].without(question.rivals[0].effect)
+        names = [*(rival.name for rival in question.rivals), NONE]
+        twins.append(without)
+        left = {}
+        windows = [*self.study.windows, *(scan.window for scan in self.new)]
+        for name, twin, fit in zip(names, twins, fit_rivals(twins, windows), strict=True):
+            placed = twin.at(fit.vector).placed()
+            left[name] = [left_nm(scan, placed.height(scan)) for scan in self.new]
+        return compared(question, self.new, left)
+
+    def of_single_scans(self, question: Question) -> Decision:
+        """Analysis of variance of a term of single scans: prints against repeats."""
+        placed, own = self.twin.placed(), terms_of_effect(question.name)
+        scans = SingleScans(self.study, self.new, [placed.height(scan) for scan in self.new])
+        by_print: dict[str, list[np.ndarray]] = {}
+        for scan, values in zip(
+            self.new, scans.coefficients(own, own | {"offset", "gain", "bow"}), strict=True
+        ):
+            by_print.setdefault(scan.stored.print_id, []).append(values)
+        repeated = [np.array(one) for one in by_print.values() if len(one) > 1]
+        count, total = len(repeated), sum(map(len, repeated))
+        if count < 2:
+            return _decision(question, self.new, BOTH, "no print was scanned twice", UNSEEN)
+        ratio = float(np.median(f_oneway(*repeated).statistic))
+        law = f_distribution(count - 1, total - count)
+        expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
+        told = f"F({count - 1}, {total - count}) = {ratio:.2f} of prints against repeats"
+        return _of_owner(
+            question, self.new, told, law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P
+        )
+
+    def of_lines(self, question: Question) -> Decision:
+        """Variance of line offsets along the layout's rows and along the scan lines of turned scans."""
+        turned = [scan for scan in self.new if axis_along(scan.line) == 0]
+        if not turned:
+            return _decision(question, self.new, BOTH, "no scan is turned", UNSEEN)
+        placed, rows, lines = self.twin.placed(), [], 0
+        for scan in turned:
+            used, index = scan.usable, row_index(scan.usable.shape)
+            residual = freed_um(scan.stored.height_um, placed.height(scan), used, frozenset({"offset"}))
+            offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in (index, scan.line))
+            rows.append([*offsets, residual[used].var() / used.shape[1]])
+            lines += len(used)
+        written, scanned, own = 1e6 * np.mean(rows, axis=0)
+        z = (written - scanned) / ((written + scanned + own) * np.sqrt(2 / lines))
+        told = (
+            f"offsets vary by {written:.1f} nm² along the layout's rows and by {scanned:.1f} nm² along the "
+            f"lines of the turned scans (z = {z:.1f})"
+        )
+        return _of_owner(question, turned, told, z >= Z_DECIDED, z <= -Z_DECIDED)
+
+
+def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
+    """The result with what was decided: an effect that is left alone is explained, and has an owner."""
+    decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
+    roles = {
+        rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
+        for question in open_.questions
+        for rival in question.rivals
+        if (question.name, rival.name) in decided
+    }
+    effects = [
+        one.model_copy(update={"verdict": "explained", "confusable_with": [], "role": roles[one.name]})
+        if one.name in roles
+        else one
+        for one in result.effects
+    ]
+    return result.model_copy(update={"decisions": decisions, "effects": effects})
+
+
+def compared(
+    question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
+) -> Decision:
+    """Judge the answers to a question by what each leaves of the new scans, maps (y, x) in nm."""
+    comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
+    # As in the loop: a smaller difference may come from what no rival describes.
+    least = {
+        name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
+        for name, own in left_nm.items()
+    }
+    excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
+    left = [name for name in left_nm if name not in {*excluded, NONE}]
+    told = [
+        f"{one.better} better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})"
+        for one in comparisons
+        if one.better in left and one.worse != NONE
+    ] or ["no rival is better than another"]
+    if len(left) > 1 and question.form_nm is not None:
+        nearest_nm = min(one.difference_nm for one in comparisons if {one.better, one.worse} <= {*left})
+        told.append(
+            f"the model's own error is {question.form_nm:.1f} nm at most, the nearest two that are left "
+            f"differ by {nearest_nm:.1f} nm"
+        )
+    nothing = not left or (NONE not in excluded and len(left) == 1)
+    decision = _decision(question, new, left, "; ".join(told), NONE if nothing else None)
+    return decision.model_copy(update={"comparisons": comparisons})
+
+
+def _compare(
+    pair: tuple[str, str],
+    left_nm: Mapping[str, Sequence[np.ndarray]],
+    new: Sequence[PreparedScan],
+    question: Question,
+) -> Comparison:
+    """Squared errors of two rivals: sums over blocks of a print, their spread within and between prints."""
+    by_print: dict[str, np.ndarray] = {}
+    pixels, difference = 0, 0.0
+    for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
+        pixels += int(np.isfinite(first).sum())
+        difference += float(np.nansum((second - first) ** 2))
+        name = scan.stored.print_id
+        by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
+    total = float(sum(sums.sum() for sums in by_print.values()))
+    # The mean over blocks is what the print says; their spread about it is noise.
+    noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
+    sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
+    form = pixels * (question.form_nm or 0.0) ** 2
+    return Comparison(
+        better=pair[total < 0],
+        worse=pair[total >= 0],
+        gain_nm2=abs(total) / max(pixels, 1),
+        z=surely_better(abs(total), difference, sd, form),
+        difference_nm=float(np.sqrt(difference / max(pixels, 1))),
+    )
+
+
+def _block_sums(gain: np.ndarray) -> np.ndarray:
+    rows, columns = (np.arange(max(2, n // _BLOCK_PX)) * n // max(2, n // _BLOCK_PX) for n in gain.shape)
+    return np.add.reduceat(np.add.reduceat(np.nan_to_num(gain), rows, axis=0), columns, axis=1)
+
+
+def _of_owner(
+    question: Question, scans: Sequence[PreparedScan], evidence: str, printer: bool, scanned: bool
+) -> Decision:
+    left = BOTH if printer == scanned else [PRINTER if printer else MICROSCOPE]
+    return _decision(question, scans, left, evidence)
+
+
+def _decision(
+    question: Question,
+    scans: Sequence[PreparedScan],
+    left: Sequence[str],
+    evidence: str,
+    verdict: Decided | None = None,
+) -> Decision:
+    """What these scans say of a question; decided, unless stated otherwise, where one answer is left."""
+    return Decision(
+        question=question.name,
+        kind=question.kind,
+        declared=[rival.name for rival in question.rivals] or list(BOTH),
+        left=list(left),
+        verdict=verdict or ("decided" if len(left) == 1 else "still open"),
+        evidence=evidence,
+        prints=len({scan.stored.print_id for scan in scans}),
+        scans=len(scans),
+    )

@@ -1,0 +1,219 @@
+"""What a closed loop leaves open, with everything that an experiment needs to be planned from it.
+
+A set that the prints cannot tell apart is kept as rivals: the corrected model with each member in turn,
+fitted again to all scans. What may be the printer's or the microscope's is kept as two: it goes with the
+print, or with the scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from litho_data.layouts.statistics import layout_statistics
+from litho_data.store import PrintedScan
+from litho_models.effects import CATALOGUE, get_effect
+from litho_models.effects.registry import TIP
+from litho_models.fitting.least_squares import eliminated_sum
+from litho_models.fitting.runs import level_share
+from litho_models.planning.noise import left_nm, noise_spectrum
+from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival
+from litho_models.planning.rival_fits import fit_rivals
+from litho_models.scan_terms import line_terms, terms_of_effect
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.closing import Closed, held_out_maps
+from litho_models.twin.fits import RULES
+from litho_models.twin.learner import Learner
+from litho_models.twin.model import Twin
+from litho_models.twin.record import CloseLoop
+from litho_models.twin.results import clustered_covariance, independent
+from litho_models.twin.screening import Candidate
+from litho_models.twin.search import WORTH_FITTING, Cause, separating
+
+# Members of a set, or suspects: every pair of rivals is compared on every layout.
+_MOST_MEMBERS = 3
+# Of a layout whose spectrum can be told.
+_SMALLEST_PX, _POWER_KNOWN = 64, 0.95
+_OF_PLACE = ("vignetting", "field-curvature")
+
+
+def open_questions(
+    closed: Closed,
+    result: CloseLoop,
+    report: Callable[[str], None] = lambda message: None,
+) -> OpenQuestions:
+    """Everything that is open, the most valuable first, rivals fitted."""
+    asking = _Asking(closed, report)
+    found = [asking.of_cause(one) for one in (*closed.causes, *closed.lawful.causes)]
+    stored = [scan.stored for scan in closed.study.scans]
+    return OpenQuestions(
+        dataset=result.dataset,
+        noise=asking.noise,
+        level_share=level_share(stored),
+        cutoff_per_um=_cutoff_per_um(stored),
+        write_field_um=(stored[0].write or {}).get("field_um"),
+        questions=[
+            *(one for one in (*found, asking.of_suspects()) if one is not None),
+            *_of_single_scans(result),
+            *(_question("fact", [one], text=why) for one, why in _missing_facts(closed).items()),
+        ],
+    )
+
+
+def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
+    """Up to where most of the power of the layouts lies, cycles/µm."""
+    first, layouts = scans[0], [scan.mask_level for scan in scans]
+    if min(first.shape) < _SMALLEST_PX:
+        return 0.05 / first.pitch_um
+    known = layout_statistics(layouts, levels=first.levels, pitch_um=first.pitch_um)
+    return known.frequency_per_um[int(np.searchsorted(np.cumsum(known.power_share), _POWER_KNOWN))]
+
+
+class _Asking:
+    """Questions with rivals, about one closed loop."""
+
+    def __init__(self, closed: Closed, report: Callable[[str], None]):
+        self.closed, self.study, self.report = closed, closed.study, report
+        self.twin = closed.final.twin.ungrouped()
+        self.maps = held_out_maps(closed.final, closed.study, closed.study.scans)
+        self.left_nm = self._left_by(self.maps)
+        self.noise = noise_spectrum(self.left_nm)
+
+    def of_cause(self, cause: Cause) -> Question | None:
+        """The set of a cause or a law, or whose it is; None if nothing is open."""
+        members = [cause.name, *cause.alike][:_MOST_MEMBERS]
+        if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
+            return None
+        without = self.twin.without(cause.name)
+        # In the place of another a member starts as before any of them was found.
+        first = {**self.closed.lawful.first, **self.closed.named.first}
+        twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
+        rests = list(self.closed.rests.values())
+        return _question(
+            "set" if cause.alike else "role",
+            members,
+            rivals=self._rivals(members, twins),
+            spread=self._spread(cause.name),
+            form_nm=rests[-1].most_nm if rests else None,
+        )
+
+    def of_suspects(self) -> Question | None:
+        """What stood out and was not confirmed: which of these carries what is left, if any does."""
+        named = self.closed.named
+        least = WORTH_FITTING * 0.01 * named.state.mse_nm2
+        standing = [
+            one
+            for name, one in named.last.items()
+            if name in named.refused and name not in self.twin.names and one.allowed and one.gain_nm2 >= least
+        ]
+        standing = sorted(standing, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
+        names = [one.name for one in standing]
+        if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
+            return None
+        twins = [_with(self.twin, one) for one in standing]
+        rivals = self._rivals(names, twins)
+        # The loop knows the error of its form with none of them in, which is theirs as well.
+        learner = Learner(self.study, self.maps)
+        placed = [rival.twin(self.twin.alone()).placed() for rival in rivals]
+        rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in placed]
+        return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
+
+    def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> list[Rival]:
+        self.report(f"fitting the rivals {', '.join(members)}")
+        windows, units = self.study.windows, independent(self.study.scans)
+        stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
+        rivals = []
+        for member, twin, fit in zip(members, twins, fit_rivals(twins, windows), strict=True):
+            fitted = twin.at(fit.vector)
+            free = fitted.free()[:, None]
+            linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
+            information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
+            effects = fitted.values({})
+            rivals += [
+                Rival(
+                    effect=member,
+                    owner=owner,
+                    effects=effects,
+                    vector=fit.vector.tolist(),
+                    information=information.tolist(),
+                    covariance=clustered_covariance(linear, units).tolist(),
+                )
+                for owner in _owners(member, effects[member])
+            ]
+        return rivals
+
+    def _left_by(self, maps_um: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
+
+    def _spread(self, name: str) -> float:
+        """How much the evidence for an effect varies over scans, relative to its mean, beyond noise.
+
+        Each scan says by which multiple a it wants the change d; the difference of its squared errors is
+        |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a. What groups differ by is
+        in d: one more of them does not make its prints contradict each other.
+        """
+        without = held_out_maps(self.closed.final.without(name, self.study), self.study, self.study.scans)
+        multiples, own = [], []
+        for before, after in zip(self._left_by(without), self.left_nm, strict=True):
+            change = np.nan_to_num(before - after)
+            size = float((change**2).sum())
+            if size:
+                multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
+                own.append(self.noise.along(change) ** 2 / size)
+        # Robust: a scan may have a defect.
+        spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
+        return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
+
+
+def _with(twin: Twin, one: Candidate) -> Twin:
+    return twin.with_effect(one.name, ALL, one.start()).ungrouped()
+
+
+def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
+    """Whose an effect may be: that of the catalogue, or either's where one orientation cannot say.
+
+    A tip that is sharper along one axis looks as a print whose flanks stand proud along one.
+    """
+    uneven = name == TIP and values["along"] != values["across"]
+    return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
+
+
+def _of_single_scans(result: CloseLoop) -> list[Question]:
+    """Terms of single scans whose owner is not known, and offsets of lines."""
+    return [
+        _question(
+            "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
+            [one.name],
+            sizes={parameter: spread.value for parameter, spread in one.spread.items()},
+        )
+        for one in result.single_scans
+        if one.seen and terms_of_effect(one.name) and (one.role == "undetermined" or one.confusable_with)
+    ]
+
+
+def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
+    """A question about effects, in words."""
+    first, *others = [get_effect(name).title for name in names]
+    if kind == "lines":
+        text = "offsets of lines: written or scanned"
+    elif kind == "fact":
+        text = f"{first}: {text}"
+    elif others:
+        text = f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
+    else:
+        text = f"{first}: the printer's or the microscope's"
+    name = " or ".join(names) if kind == "suspects" else names[0]
+    return Question(name=name, kind=kind, text=text, experiment=separating(names), **known)
+
+
+def _missing_facts(closed: Closed) -> dict[str, str]:
+    """Effects that could not be tested for want of a fact about the prints, with the reason."""
+    reasons = {name: why for name, why in closed.untestable.items() if name in CATALOGUE}
+    if "field_um" not in (closed.study.scans[0].stored.write or {}):
+        reasons = (
+            dict.fromkeys(_OF_PLACE, "the place of the prints in the write field is not known") | reasons
+        )
+    return reasons

@@ -1,0 +1,95 @@
+"""``open_questions.json``: what a closed loop leaves open, as an experiment can be planned from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_data.store.schema import DatasetId
+from litho_models.planning.noise import NoiseSpectrum
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.model import Twin
+from litho_models.twin.run import QUESTIONS_FILE
+
+Kind = Literal["set", "suspects", "role", "per-scan", "lines", "fact"]
+Owner = Literal["printer", "microscope"]
+
+
+class Rival(Record):
+    """One answer to a question: the base with these effects, one strength each, as the prints so far have it.
+
+    Attributes:
+        effect: what is at work; ``owner``: whose it is, where that is open.
+        vector: all fitted numbers, those of the base first; ``information``: (p, p), normal matrix of the fit
+            over all pixels that it stands for, µm²; ``covariance``: (p, p), robust over prints or scans.
+    """
+
+    effect: str
+    owner: Owner | None = None
+    effects: dict[str, dict[str, float]]
+    vector: list[float]
+    information: list[list[float]]
+    covariance: list[list[float]] = Field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The answer in words."""
+        return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
+
+    def twin(self, bare: Twin) -> Twin:
+        """The model; ``bare``: its base alone."""
+        for name, values in self.effects.items():
+            bare = bare.with_effect(name, ALL, {"": values})
+        return framed(bare.at(np.array(self.vector)), self.effect, self.owner)
+
+
+def framed(twin: Twin, effect: str, owner: Owner | None) -> Twin:
+    """A model in which an effect goes with the print, or with the scan."""
+    own = frozenset([effect])
+    return replace(
+        twin,
+        scan_frame=own if owner == "microscope" else frozenset(),
+        print_frame=own if owner == "printer" else frozenset(),
+    )
+
+
+class Question(Record):
+    """Something a loop left open.
+
+    Attributes:
+        spread: how much the evidence that a print gives for the effect varies between the prints so far,
+            relative to its mean, beyond the noise.
+        form_nm: the error of the model's own form at most, rms, by what could still be learned beside the
+            best answer; None where it is not known.
+        sizes: figures of terms of single scans, by name and unit.
+    """
+
+    name: str
+    kind: Kind
+    text: str
+    experiment: str
+    rivals: list[Rival] = Field(default_factory=list)
+    spread: float = 0.0
+    form_nm: float | None = None
+    sizes: dict[str, float] = Field(default_factory=dict)
+
+
+class OpenQuestions(Result):
+    """``open_questions.json``: what is open, and the noise against which it is to be decided.
+
+    ``level_share``: of the layouts so far; ``cutoff_per_um``: the finest structure in them, cycles/µm.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
+    FILE_NAME: ClassVar[str] = QUESTIONS_FILE
+
+    dataset: DatasetId
+    noise: NoiseSpectrum
+    level_share: list[float]
+    cutoff_per_um: float
+    write_field_um: float | None
+    questions: list[Question]

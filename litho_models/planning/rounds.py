@@ -1,0 +1,84 @@
+"""A loop with what it leaves open, and with what later prints of the same printer decide of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Result
+from litho_data.store import PrintedScan, Store, open_store
+from litho_models.planning.deciding import decide, with_decisions
+from litho_models.planning.open_questions import open_questions
+from litho_models.twin import run
+from litho_models.twin.closing import Closed
+from litho_models.twin.record import CloseLoop
+
+
+def close_loop(
+    store: str | Path,
+    out: str | Path,
+    *,
+    new_prints: Sequence[str | Path] = (),
+    report: Callable[[str], None] = lambda message: None,
+    **settings: Any,
+) -> CloseLoop:
+    """Close the loop on a store, ``twin.run.close_loop``, and write what it leaves open beside it.
+
+    Args:
+        new_prints: further stores of the same printer. What is found on the first store stays as it is; the
+            new prints decide between the answers to what is open, see ``deciding``.
+        settings: of ``twin.run.close_loop``.
+
+    Raises:
+        InputError: as there; further stores of another printer, or with a turned scan whose card
+            does not say so.
+    """
+    first, further = open_store(store), [open_store(path) for path in new_prints]
+    new = [scan for one in further for scan in new_scans(first, one)]
+
+    def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
+        open_ = open_questions(closed, result, report)
+        settings = {**result.settings, "new_prints": [one.sha256 for one in further]}
+        result = result.model_copy(update={"settings": settings})
+        if new:
+            result = with_decisions(result, open_, decide(closed, open_, new, report))
+        return result, [open_]
+
+    return run.close_loop(store, out, further=asked, report=report, **settings)
+
+
+def new_scans(first: Store, store: Store) -> list[PrintedScan]:
+    """The scans of a further store, checked to be of the same printer and turned as their card says.
+
+    Raises:
+        InputError: of another printer, or turned otherwise.
+    """
+    for name in ("pitch_um", "level_height_um", "levels"):
+        if getattr(store, name) != getattr(first, name):
+            raise InputError(
+                f"{name} of {store.path}",
+                got=getattr(store, name),
+                wanted=f"{getattr(first, name)}, as before",
+            )
+    planned = store.manifest.get("card", {}).get("plan", {}).get("dataset_sha256")
+    if planned is not None and planned != first.sha256:
+        raise InputError(
+            f"prints of {store.path}",
+            got=f"a plan for dataset {planned[:12]}…",
+            wanted=f"a plan for {first.path}, {first.sha256[:12]}…",
+            hint="they were printed for another printer's questions",
+        )
+    scans = store.scans()
+    for scan in scans:
+        stated = round((scan.turned_deg or 0.0) / 90)
+        # From which side a print was turned is a convention; that it was turned shows in its registration.
+        if (stated - scan.quarter_turns) % 2:
+            raise InputError(
+                f"scan {scan.id} of {store.path}",
+                got=f"turned by {90 * scan.quarter_turns}° on its layout, {90 * stated}° in its card",
+                wanted="what the scan shows",
+                hint="add the column turned_deg to the table of the card, and build again",
+            )
+    return scans

@@ -1,0 +1,94 @@
+"""The model whose shortcomings are sought: the best of several small ones, or the one that is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan
+from litho_models.fitting import TrainingConfig, fit_in_cache
+from litho_models.frozen import zoo
+from litho_models.models import MODELS, build_model
+from litho_models.simulator import Simulator, is_small
+from litho_models.twin.fits import Study, fit_state
+from litho_models.twin.folded_base import train_folds
+from litho_models.twin.model import Twin
+from litho_models.twin.prepared import prepare_scans
+
+AUTO = "auto"
+# Bases that compete where none is asked for, the first one the form of the paper's physics.
+_COMPETING = ("physics", "affine-mtf", "blur-table")
+
+
+@dataclass(frozen=True)
+class Base:
+    """``model``: where fits begin, or taken as it is; ``others``: small models that lost against it."""
+
+    name: str
+    model: nn.Module
+    others: Mapping[str, nn.Module]
+
+
+def choose_base(
+    base: str, scans: Sequence[PrintedScan], study: Study, *, steps: int | None, cache: Path
+) -> Base:
+    """The base by what was asked for; a network is trained without each fold.
+
+    Args:
+        base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
+        study: settings: folds, seed, workers, report.
+        steps: optimiser steps of a network, the recipe's if None; ``cache``: where its trainings are kept.
+
+    Raises:
+        InputError: no such base, or one of another pitch.
+    """
+    if base == AUTO:
+        return _best(scans, study)
+    if base not in MODELS:
+        return _frozen(base, scans[0].pitch_um)
+    model = _built(base, scans[0])
+    if is_small(model):
+        return Base(base, model, {})
+    settings: dict[str, Any] = {"seed": study.seed} if steps is None else {"seed": study.seed, "steps": steps}
+    trainer = partial(_trained, base, TrainingConfig.of_recipe("fast", base, **settings), cache)
+    return Base(base, train_folds(prepare_scans(scans), study.fold_of, trainer, study.workers), {})
+
+
+def _best(scans: Sequence[PrintedScan], study: Study) -> Base:
+    prepared = prepare_scans(scans)
+    plain = replace(study, scans=prepared)
+    built = {name: _built(name, scans[0]) for name in _COMPETING}
+    errors = {}
+    for name, one in built.items():
+        study.report(f"trying {name} as the base")
+        errors[name] = fit_state(Twin.bare(one, prepared[0]), plain).mse_nm2
+    best = min(errors, key=lambda name: errors[name])
+    return Base(best, built.pop(best), built)
+
+
+def _built(name: str, scan: PrintedScan) -> Simulator:
+    fields: dict[str, Any] = {"spot": "round"} if name == "physics" else {}
+    return build_model(
+        name, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um, levels=scan.levels, **fields
+    )
+
+
+def _trained(base: str, settings: TrainingConfig, cache: Path, scans: Sequence[PrintedScan]) -> nn.Module:
+    return fit_in_cache(base, scans, settings, cache).model
+
+
+def _frozen(base: str, pitch_um: float) -> Base:
+    from litho_models.frozen.card import ModelCard
+    from litho_models.frozen.files import load_simulator
+
+    folder = zoo.model_folder(base, other=[AUTO, *MODELS])
+    card = ModelCard.read(folder)
+    if abs(card.pitch_um - pitch_um) > 1e-9:
+        raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=f"{pitch_um:g} µm")
+    return Base(card.name, load_simulator(folder, card), {})

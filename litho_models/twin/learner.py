@@ -1,0 +1,199 @@
+"""How much of a residual could still be learned: a ridge over features of layout and place, out of fold.
+
+It has no name for what it finds and goes into no model. It says whether something is left to be found, and
+what a named cause weighs beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.fitting.least_squares import gram_inside, orthonormal
+from litho_models.fitting.ridge import feature_rows
+from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
+from litho_models.scan_terms.grouped import Block, Products
+from litho_models.scan_terms.groups import ALL
+from litho_models.scoring.statistics import interval
+from litho_models.twin.fits import ALL_FREE, Study
+from litho_models.twin.judging import SMALLEST_SHARE
+from litho_models.twin.prepared import PreparedScan, sample_border_px
+
+# All rows of all scans; with more scans each is thinned.
+_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
+# Features whose strength may follow the place: height, ∂y and ∂x at 0.3 µm (a gain and a displacement); and
+# order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
+_PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
+_ORDER_STEPS = (-0.25, 0.0, 0.25)
+_FEWEST_ORDERS = 3
+# Cubic splines along each axis of a scan.
+_SPLINES = 5
+# Scans' worth of evidence for nothing to learn: which of them is chosen inside the training folds.
+_SHRINKING = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What the learner explains of one residual, out of fold.
+
+    Attributes:
+        gains_nm2: (scans,) taken from the squared error of each scan by the ridge that has not seen it.
+        squares_nm2: (scans,) the squared error itself; both free of ``k`` terms per scan.
+    """
+
+    gains_nm2: np.ndarray
+    squares_nm2: np.ndarray
+    k: int
+
+    @property
+    def mean_nm2(self) -> float:
+        return float(self.gains_nm2.mean())
+
+    @property
+    def share(self) -> float:
+        """Of the squared error."""
+        return self.mean_nm2 / max(float(self.squares_nm2.mean()), np.finfo(float).tiny)
+
+    @cached_property
+    def ci95_nm2(self) -> tuple[float, float] | None:
+        """Interval over scans of the mean gain; None with fewer than six scans."""
+        return interval(self.gains_nm2.tolist())
+
+    @property
+    def most_nm(self) -> float:
+        """The root of the upper end of the interval: what the form of the model may be wrong by, rms."""
+        interval_nm2 = self.ci95_nm2
+        return float(np.sqrt(max(self.mean_nm2 if interval_nm2 is None else interval_nm2[1], 0.0)))
+
+    @property
+    def matters(self) -> bool:
+        """Whether something is left that can be learned: more than 1 %, and an interval without zero."""
+        return self.share > SMALLEST_SHARE and self.ci95_nm2 is not None and self.ci95_nm2[0] > 0
+
+
+class Learner:
+    """Feature rows of the scans of a study, made once; each residual then costs a few solves.
+
+    Args:
+        study: scans and folds.
+        predictions: (y, x) µm, one per scan: what a scan's own gain multiplies.
+    """
+
+    def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
+        self._study = study
+        self._predictions = list(predictions)
+        model = _all_features(study.scans[0])
+        pixels = sum(len(scan.sample) for scan in study.scans)
+        self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
+        varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= _FEWEST_ORDERS]
+        rows = [self._rows(model, scan, varied) for scan in study.scans]
+        scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
+        self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
+        self._bases = [
+            orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
+            for scan, own in zip(study.scans, predictions, strict=True)
+        ]
+        self._grams = np.stack(
+            [
+                (_gram(own) - gram_inside(own.T, basis)) / len(basis)
+                for own, basis in zip(self._rows_of, self._bases, strict=True)
+            ]
+        )
+
+    def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
+        """What the features explain of measured minus predicted, each scan by a ridge that has not seen it.
+
+        Args:
+            predictions: held-out predictions (y, x) µm, one per scan.
+        """
+        scans, count = self._study.scans, self._grams.shape[1]
+        grams = np.zeros((len(scans), 1 + count, 1 + count))
+        grams[:, 1:, 1:] = self._grams
+        for scan, own, rows, basis, gram in zip(
+            scans, predictions, self._rows_of, self._bases, grams, strict=True
+        ):
+            residual = (scan.height - scan.at_sample(own))[:: self._every]
+            residual -= basis @ (basis.T @ residual)
+            gram[0, 0] = np.mean(residual**2)
+            gram[0, 1:] = gram[1:, 0] = rows @ residual / len(residual)
+        left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
+        squares = grams[:, 0, 0] * NM_PER_UM**2
+        return Rest(squares - left, squares, self._bases[0].shape[1])
+
+    def _rows(
+        self, model: Features, scan: PreparedScan, varied: Sequence[Callable[[PreparedScan], float]]
+    ) -> NDArray[np.float32]:
+        """Features of layout and place, and some times order and dose, (m, n)."""
+        at = scan.sample[:: self._every]
+        of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
+        varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
+        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in _PLACED)]
+        for of in varied:
+            value = of(scan)
+            columns += [value * varying, *((value > step) * varying for step in _ORDER_STEPS)]
+        return np.concatenate(columns).astype(np.float32)
+
+
+def _order(scan: PreparedScan) -> float:
+    return scan.context.order
+
+
+def _dose(scan: PreparedScan) -> float:
+    """Less its nominal value, so that it has both signs as the order has."""
+    return (scan.stored.dose or 1.0) - 1.0
+
+
+_VARIED = (_order, _dose)
+
+
+def _gram(rows: np.ndarray) -> np.ndarray:
+    exact = rows.astype(np.float64)
+    return exact @ exact.T
+
+
+def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
+    """Mean squared residual (scans,) by ridges fitted, and their weight chosen, without each scan's fold."""
+    left = np.empty(len(grams))
+    columns = tuple(range(1, grams.shape[1]))
+    blocks = [Block(columns, ALL, shrinking) for shrinking in _SHRINKING]
+    products = Products(grams, {ALL: ("",) * len(grams)})
+    for fold in np.unique(fold_of):
+        own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
+        inner, inner_fold = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
+        if len(set(inner_fold)) == 1:
+            inner_fold = np.arange(len(rest))
+        block = min(blocks, key=lambda one: float(inner.held_out([one], inner_fold).sum()))
+        left[own] = products.squares([block], products.strengths([block], rest), own)
+    return left
+
+
+def _all_features(scan: PreparedScan) -> Features:
+    """All features of the zoo, without the random ones, for scans like this one; weights are not fitted."""
+    first = scan.stored
+    config = RandomFeaturesConfig.of_variant(
+        pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
+    )
+    return Features(FeaturesConfig(**config.model_dump(include=set(FeaturesConfig.model_fields))))
+
+
+def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
+    """Products of splines along y and x at flat indices of a scan, (25, n)."""
+    (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
+    return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
+
+
+def _splines(size: int) -> np.ndarray:
+    """Cubic splines (5, size) over the sampled part of an axis, constant beyond it; they add up to 1.
+
+    A spline that only pixels beyond it hold would be drawn there without having been measured.
+    """
+    first = sample_border_px(size)
+    position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, _SPLINES - 2), [1.0] * 3])
+    return BSpline.design_matrix(position, knots, 3).toarray().T

@@ -1,0 +1,175 @@
+"""What is seen in single scans directly, without a model: rounding, scars, short lines, bends.
+
+None of it lowers an error on held-out scans. It has evidence, and no place in the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.effects import CATALOGUE
+from litho_models.scan_terms import POLICIES, freed_um, row_index
+from litho_models.scan_terms.lines import axis_along
+from litho_models.scoring.statistics import one_sided_flip_p
+from litho_models.twin.judging import CONFIRM_P, SMALLEST_RMSE_NM
+from litho_models.twin.prepared import PreparedScan
+from litho_models.twin.record import ScanFinding
+
+# Heights closer than this share of their range are one value of a file that rounds in single precision.
+_SAME_VALUE, _OFF_COMB, _ON_COMB_SHARE = 1e-6, 0.05, 0.99
+# A mark stands out by so many robust standard deviations on so many pixels, and is so much longer than wide.
+_FAR_SD, _FEWEST_PX, _DRAWN_OUT, _FEWEST_SCARS = 5.0, 9, 4.0, 10
+# Beyond the sharpness of tip and spot, and within the length of a line-shaped feature.
+_LINE_LAGS_UM = (0.3, 0.8)
+
+
+def marks(
+    scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], rounding_um: Mapping[str, float] | None
+) -> list[ScanFinding]:
+    """All that is seen directly.
+
+    Args:
+        scans: as they are; ``maps_um``: the maps (y, x) that they should show.
+        rounding_um: step of the heights in each scan's raw file, by id; None without raw files.
+    """
+    residuals = [
+        freed_um(scan.stored.height_um, own, scan.usable, POLICIES["full"])
+        for scan, own in zip(scans, maps_um, strict=True)
+    ]
+    found = [_scars(scans, residuals), _short_lines(scans, maps_um, residuals), _bends(scans)]
+    if rounding_um is not None:
+        found.append(_rounding(list(rounding_um.values())))
+    return found
+
+
+def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
+    """Terms and marks, each name once: it is there if either says so."""
+    found = {one.name: one for one in findings}
+    for mark in seen:
+        term = found.get(mark.name, mark)
+        first, second = (term, mark) if term.seen or not mark.seen else (mark, term)
+        evidence = "; ".join(dict.fromkeys((first.evidence, second.evidence)))
+        found[mark.name] = first.model_copy(update={"evidence": evidence})
+    return [*found.values()]
+
+
+def rounding_step_um(raw_height_um: np.ndarray) -> float:
+    """Step of which all heights of a raw scan are multiples, up to one offset; 0 where there is none."""
+    heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
+    if len(heights) < 3:
+        return 0.0
+    steps = np.diff(heights)
+    steps = steps[steps > _SAME_VALUE * (heights[-1] - heights[0])]
+    if not len(steps):
+        return 0.0
+    step = float(np.median(steps[steps < 1.5 * steps.min()]))
+    places = (heights - heights[0]) / step
+    off = np.abs(places - np.round(places))
+    return step if np.mean(off < _OFF_COMB) >= _ON_COMB_SHARE else 0.0
+
+
+def _rounding(steps_um: Sequence[float]) -> ScanFinding:
+    """Rounding of the raw files: uniform noise of step / √12."""
+    steps_nm = NM_PER_UM * np.array(steps_um)
+    noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
+    if not len(rounded):
+        return _finding("quantisation", False, "the heights of the raw files share no common step")
+    text = (
+        f"the raw heights of {len(rounded)} of {len(steps_nm)} scans are multiples of "
+        f"{np.median(rounded):.3g} nm, which adds {noise_nm:.2g} nm rms"
+    )
+    return _finding("quantisation", noise_nm >= SMALLEST_RMSE_NM, text)
+
+
+def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
+    """Outliers drawn out along the scan lines, against those drawn out across them, scan by scan."""
+    counts = np.array([_drawn_out(scan, own) for scan, own in zip(scans, residuals, strict=True)])
+    along, across = counts.T
+    p = one_sided_flip_p((along - across).astype(float))
+    text = f"{along.sum()} outliers drawn out along the lines and {across.sum()} across them (p = {p:.4f})"
+    return _finding("scars-and-spikes", p <= CONFIRM_P and along.sum() >= _FEWEST_SCARS, text, p)
+
+
+def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
+    """Outliers that are long along the rows, and along the columns."""
+    seen = residual_um[scan.usable]
+    spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
+    numbered, _ = label(scan.usable & (np.abs(residual_um) > _FAR_SD * spread))
+    sizes = np.bincount(numbered.ravel())
+    along = across = 0
+    for number, box in enumerate(find_objects(numbered), 1):
+        height, width = (part.stop - part.start for part in box)
+        if sizes[number] >= _FEWEST_PX:
+            along += width >= _DRAWN_OUT * height
+            across += height >= _DRAWN_OUT * width
+    return along, across
+
+
+def _short_lines(
+    scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
+) -> ScanFinding:
+    """Residual that neighbours along a scan line share and neighbours across do not, in flat places.
+
+    Slopes are left out: what a model misses there is not noise.
+    """
+    shared = np.array([_shared_nm2(*one) for one in zip(scans, maps_um, residuals, strict=True)])
+    along, across = shared.T
+    p = one_sided_flip_p(along - across)
+    rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
+    text = (
+        f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² "
+        f"along the lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
+        f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
+    )
+    return _finding("line-roughness", p <= CONFIRM_P and rms_nm >= SMALLEST_RMSE_NM, text, p)
+
+
+def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
+    """Mean product of residuals some lags apart, along the lines and across them, nm²."""
+    slope = np.hypot(*np.gradient(prediction))
+    flat = scan.usable & (slope <= np.median(slope))
+    values = np.where(flat, NM_PER_UM * residual_um, 0.0)
+    for line in (scan.line, row_index(flat.shape)):
+        # What this takes off too much makes neighbours along a line share less, not more.
+        total, count = (
+            np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
+        )
+        values = np.where(flat, values - (total / np.maximum(count, 1))[line], 0.0)
+    first, last = (max(1, round(lag / scan.context.pitch_um)) for lag in _LINE_LAGS_UM)
+
+    def mean_product(v: np.ndarray, w: np.ndarray) -> float:
+        lags = range(first, last + 1)
+        products = sum(float((v[:, lag:] * v[:, :-lag]).sum()) for lag in lags)
+        pairs = sum(float((w[:, lag:] * w[:, :-lag]).sum()) for lag in lags)
+        return products / max(pairs, 1.0)
+
+    by_row, by_column = (
+        mean_product(v, w) for v, w in ((values, flat.astype(float)), (values.T, flat.T.astype(float)))
+    )
+    # A scan turned by 90 degrees has its lines along y.
+    return (by_column, by_row) if axis_along(scan.line) == 0 else (by_row, by_column)
+
+
+def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
+    """Scans that registration found bent, and straightened: all else sees them without their bend."""
+    found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
+    text = f"registration straightened {len(found_um)} of {len(scans)} scans"
+    if found_um:
+        text += f", bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
+    return _finding("registration-residual", bool(found_um), text)
+
+
+def _finding(name: str, seen: bool, evidence: str, p: float | None = None) -> ScanFinding:
+    effect = CATALOGUE.get(name)
+    return ScanFinding(
+        name=name,
+        title=effect.title if effect else name,
+        role=effect.role if effect else "measurement",
+        seen=bool(seen),
+        evidence=evidence,
+        p=p,
+    )

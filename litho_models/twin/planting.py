@@ -1,0 +1,69 @@
+"""How small an effect would be found here: plant it in copies of these scans and close the loop on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan
+from litho_models.effects import Effect, get_effect
+from litho_models.twin.closing import Closed
+from litho_models.twin.fits import without_terms
+from litho_models.twin.model import finished
+from litho_models.twin.record import Planted
+
+
+def parse_planted(text: str) -> tuple[Effect, float]:
+    """Effect and amount from ``NAME=AMOUNT``, the amount in the unit of its first amplitude.
+
+    Raises:
+        InputError: another form, an unknown effect, one that differs from scan to scan, or no number.
+    """
+    name, separator, number = text.partition("=")
+    effect = get_effect(name.strip())
+    try:
+        amount = float(number)
+    except ValueError:
+        amount = float("nan")
+    if not separator or not np.isfinite(amount):
+        raise InputError("--inject", got=repr(text), wanted="NAME=AMOUNT, such as vignetting=0.1")
+    if effect.per_scan:
+        raise InputError("--inject", got=name, wanted="an effect with one value for all scans")
+    return effect, amount
+
+
+def plant(text: str, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]) -> Planted:
+    """Plant an effect beside the base in copies of the scans, and see what a new loop names.
+
+    Args:
+        text: of ``parse_planted``; ``closed``: what was found on the scans as they are.
+        close_again: the same loop on other scans.
+    """
+    effect, amount = parse_planted(text)
+    amplitude = effect.amplitudes[0]
+    values = {effect.name: {**effect.off_values(), amplitude: amount}}
+    placed = closed.base.twin.placed()
+    changed, squares = [], []
+    for scan in closed.original:
+        here = placed.height(scan)
+        chain = placed.chain(scan, values)
+        added = finished(chain, placed.base_height(chain, scan), scan) - here
+        changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
+        freed = without_terms(scan.at_sample(added)[:, None], scan, here)
+        squares.append(float(np.mean(freed**2)))
+    again = close_again(changed)
+    cause = next((one for one in again.causes if effect.name in (one.name, *one.alike)), None)
+    named = [] if cause is None else [cause.name, *cause.alike]
+    found = again.final.twin.values({}).get(effect.name, {}).get(amplitude)
+    return Planted(
+        name=effect.name,
+        amount=amount,
+        unit=effect.parameters[amplitude].unit,
+        rms_nm=NM_PER_UM * float(np.sqrt(np.mean(squares))),
+        named=named,
+        found=found,
+    )

@@ -1,0 +1,81 @@
+"""What a loop leaves for others: the corrected model of the printer, and the laws as a module."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from litho_data.store import Store
+from litho_models.effects import get_effect
+from litho_models.fitting.runs import level_share, step_share
+from litho_models.frozen.files import save_frozen
+from litho_models.simulator import Simulator
+from litho_models.twin.closing import Closed
+from litho_models.twin.folded_base import FoldedBase
+from litho_models.twin.record import CloseLoop
+
+MODEL_FOLDER, LAWS_FILE = "model", "laws.py"
+
+
+def save_laws(result: CloseLoop, folder: Path) -> None:
+    """Write a module that registers the laws that were found as effects; nothing where there is none."""
+    laws = [one for one in result.effects if one.knowledge == "law"]
+    if not laws:
+        return
+    lines = [
+        f'"""Laws found on {result.dataset.name}: import this to screen, fit and apply them by name."""',
+        "",
+        "from dataclasses import replace",
+        "",
+        "from litho_models.effects import register_effect",
+        "from litho_models.effects.laws import LAWS",
+    ]
+    for one in laws:
+        sizes = ", ".join(f"{own.value:.4g} {own.unit}" for own in one.strengths["strength"])
+        lines += [
+            "",
+            f"# {one.title}; strength {sizes}",
+            f"register_effect(replace(LAWS[{one.name!r}], name='law-{one.name}', knowledge='cause'))",
+        ]
+    (folder / LAWS_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
+    """The corrected model of the printer, with the strengths that the latest scan has."""
+    twin = closed.final.twin
+    base = twin.placed().base
+    if isinstance(base, FoldedBase):
+        base = base.common
+    assert isinstance(base, Simulator)
+    latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
+    values = twin.values(twin.labels(latest))
+    sides = {"process": "printer", "measurement": "microscope"}
+    role = {one.name: one.role for one in result.effects}
+    error = result.error("all")
+    assert error is not None
+    save_frozen(
+        base,
+        folder,
+        name=f"{result.base_model}, loop findings",
+        process_effects={name: own for name, own in values.items() if role[name] == "process"},
+        measurement_effects={name: own for name, own in values.items() if role[name] == "measurement"},
+        undetermined_effects={
+            name: own for name, own in values.items() if role[name] not in ("process", "measurement")
+        },
+        dataset=result.dataset.model_dump(mode="json"),
+        attributed={
+            one.name: sides[one.role]
+            for one in result.effects
+            if one.role in sides and get_effect(one.name).role != one.role
+        },
+        command=result.run.command,
+        split={
+            **result.split.model_dump(mode="json"),
+            "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
+        },
+        training_level_share=level_share([scan.stored for scan in closed.original]),
+        training_step_share=step_share([scan.stored for scan in closed.original]),
+        confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
+        metrics=[
+            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": "offset"},
+        ],
+    )

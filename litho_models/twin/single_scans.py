@@ -1,0 +1,240 @@
+"""What single scans add, each its own: datum, gain, bow, drift, registration, offsets of lines.
+
+Nobody can foresee it for the next print, so it enters no model. A term is judged as a variance: what it takes
+on one half of a scan's pixels, fitted on the other half, must agree with what is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness import line_period
+from litho_models.effects import get_effect
+from litho_models.scan_terms import (
+    SCAN_TERMS,
+    Blocks,
+    CrossFit,
+    Terms,
+    chosen_terms,
+    cross_fit,
+    freed_um,
+    least_squares,
+    line_terms,
+    parameter_names,
+    terms_of_effect,
+)
+from litho_models.scoring.statistics import by_print, one_sided_flip_p
+from litho_models.twin.fits import Study
+from litho_models.twin.judging import CONFIRM_P, GROUPED_P, Judgement, judge
+from litho_models.twin.prepared import PreparedScan
+from litho_models.twin.record import ScanFinding, Strength
+
+_DATUM: Terms = frozenset({"offset"})
+_SMOOTH: Terms = frozenset({"offset", "bow"})
+# A period of lines is looked for at all frequencies at once.
+_PERIOD_P = 1e-3
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Freed:
+    """Scans freed of some of their terms: residual maps (y, x), µm, NaN where not scored."""
+
+    fits: Sequence[CrossFit]
+
+    @property
+    def squares_nm2(self) -> np.ndarray:
+        """(scans,) mean squared error."""
+        return np.array([NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in self.fits])
+
+    @property
+    def rmse_nm(self) -> float:
+        return float(np.sqrt(self.squares_nm2.mean()))
+
+
+class SingleScans:
+    """The scans beside the maps that they should show, with terms fitted on pixels that are not scored.
+
+    Args:
+        study: seed, folds; ``scans``: as they are; ``maps_um``: held-out maps (y, x), measurement included.
+    """
+
+    def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
+        self.study, self.scans, self.maps_um = study, scans, maps_um
+        self.freed = cache(lambda terms: self._freed(maps_um, terms))
+
+    def findings(self) -> list[ScanFinding]:
+        """Each effect of single scans given those that were seen before it; offsets of lines come last."""
+        accepted, found = _DATUM, []
+        names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
+        lines = [name for name in names if line_terms(terms_of_effect(name))]
+        for name in names:
+            if name not in lines:
+                found.append(self._of_terms(name, accepted))
+                accepted |= terms_of_effect(name) if found[-1].seen else _DATUM
+        return found + self._of_lines(lines, accepted | _SMOOTH)
+
+    def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> Freed:
+        blocks = Blocks(seed=self.study.seed)
+        return Freed(
+            [
+                cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line)
+                for scan, own in zip(self.scans, maps_um, strict=True)
+            ]
+        )
+
+    def _of_terms(self, name: str, accepted: Terms) -> ScanFinding:
+        effect, own = get_effect(name), terms_of_effect(name)
+        before, after = self.freed(accepted - own), self.freed(accepted | own)
+        judgement = _as_variance(before, after, self.study)
+        values = self.coefficients(own, accepted | own)
+        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
+        # Where scans of one print are alike, the printer may have done it too.
+        unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
+        return ScanFinding(
+            name=name,
+            title=effect.title,
+            role="undetermined" if unclear else effect.role,
+            seen=judgement.passed(),
+            evidence=_evidence(judgement, before, after),
+            p=judgement.p,
+            spread={
+                parameter: self._spread(column, effect.parameters[parameter].unit)
+                for parameter, column in zip(effect.parameters, values.T, strict=True)
+            },
+        )
+
+    def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
+        """(scans, k) of ``own`` terms, fitted beside all ``terms``; displacements in µm."""
+        found = []
+        for scan, prediction in zip(self.scans, self.maps_um, strict=True):
+            design = scan.terms_at_sample(prediction, terms)
+            fitted = least_squares(design, scan.height - scan.at_sample(prediction))
+            fitted[_columns_of((t.name for t in chosen_terms(own) if t.unit == "px"), terms)] *= (
+                scan.context.pitch_um
+            )
+            found.append(fitted[_columns_of(own, terms)])
+        return np.stack(found)
+
+    def _spread(self, values: np.ndarray, unit: str) -> Strength:
+        """Standard deviation over scans with its bootstrap interval."""
+        count = len(values)
+        draws = np.random.default_rng(self.study.seed).integers(0, count, (_DRAWS, count))
+        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975])
+        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(float(low), float(high)))
+
+    def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
+        """Offsets of lines, along the scan and along the layout: against columns, then against each other.
+
+        Scans are turned a little against their layouts. Lines that follow the layout's rows better were
+        written, lines that follow the scan's were measured; where no scan is turned nobody can tell.
+        """
+        by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
+        before = self._freed(by_row, accepted)
+        after = {name: self._freed(by_row, accepted | terms_of_effect(name)) for name in names}
+        gains = {name: before.squares_nm2 - own.squares_nm2 for name, own in after.items()}
+        control = [self._freed(by_column, terms) for terms in (accepted, accepted | {"layout-columns"})]
+        columns = control[0].squares_nm2 - control[1].squares_nm2
+        found = []
+        for at, name in enumerate(names):
+            (other,) = (one for one in names if one != name)
+            beaten, better = (
+                one_sided_flip_p(sign * (gains[other] - gains[name])) <= CONFIRM_P for sign in (1, -1)
+            )
+            judgement = _as_variance(before, after[name], self.study)
+            excess_p = one_sided_flip_p(gains[name] - columns)
+            reasons = [judgement.reason()] if judgement.reason() else []
+            if excess_p > CONFIRM_P:
+                reasons.append(f"rows gain no more than columns (p = {excess_p:.3f})")
+            if beaten:
+                reasons.append(f"the lines follow {_frame(other)} more closely: {other}")
+            elif at and not better:
+                reasons.append(f"cannot be told from {other}: no scan is turned enough against its layout")
+            deviation = np.sqrt(np.maximum(gains[name], 0).mean()) / NM_PER_UM
+            taken = f"{gains[name].mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
+            found.append(
+                ScanFinding(
+                    name=name,
+                    title=get_effect(name).title,
+                    role=get_effect(name).role,
+                    seen=not reasons,
+                    evidence="; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
+                    p=excess_p,
+                    spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
+                    confusable_with=[] if beaten or better else [other],
+                )
+            )
+        return found
+
+    def _with_profile(self, axis: int) -> list[np.ndarray]:
+        """The maps with the mean residual of each line over the scans of the other folds added.
+
+        Scans of different sizes have no lines in common: then nothing is added.
+        """
+        if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
+            return list(self.maps_um)
+        residuals = [self._smooth(scan, own) for scan, own in zip(self.scans, self.maps_um, strict=True)]
+        totals = np.stack([one.sum(axis=axis) for one in residuals])
+        seen = np.stack([scan.usable.sum(axis=axis) for scan in self.scans])
+        found = []
+        for fold, own in zip(self.study.fold_of, self.maps_um, strict=True):
+            others = self.study.fold_of != fold
+            profile = totals[others].sum(axis=0) / np.maximum(seen[others].sum(axis=0), 1)
+            found.append(own + np.expand_dims(profile, axis))
+        return found
+
+    def _period(self, name: str) -> str:
+        """The period that the means of lines have in common, such as that of mains hum, in words."""
+        (term,) = line_terms(terms_of_effect(name))
+        means = []
+        for scan, own in zip(self.scans, self.maps_um, strict=True):
+            assert term.lines is not None
+            line, use = term.lines(scan.usable.shape, scan.line), scan.usable
+            count, total = np.bincount(line[use]), np.bincount(line[use], self._smooth(scan, own)[use])
+            means.append(total / np.maximum(count, 1))
+        found = line_period(means, self.scans[0].stored.pitch_um)
+        if found is None or found.p > _PERIOD_P:
+            return ""
+        share = 100 * found.share
+        return (
+            f"; they repeat every {found.period_um:.3g} µm, with {share:.0f} % of the squared line means "
+            f"(p = {found.p:.1g})"
+        )
+
+    def _smooth(self, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        """Residual (y, x), µm, without datum and bow, 0 where not measured."""
+        return freed_um(scan.stored.height_um, prediction, scan.usable, _SMOOTH)
+
+
+def _as_variance(before: Freed, after: Freed, study: Study) -> Judgement:
+    """A scan whose own term happens to be near zero gains nothing: the halves have to agree instead."""
+    products = [
+        np.nanmean(one.residual_um * (one.residual_um - left.residual_um))
+        for one, left in zip(before.fits, after.fits, strict=True)
+    ]
+    judged = judge(before.squares_nm2, after.squares_nm2, study)
+    return replace(judged, p=one_sided_flip_p(np.array(products)))
+
+
+def _evidence(judgement: Judgement, before: Freed, after: Freed) -> str:
+    terms = [np.mean([fit.degrees_of_freedom for fit in own.fits]) for own in (before, after)]
+    said = (
+        f"RMSE on pixels not fitted {before.rmse_nm:.2f} -> {after.rmse_nm:.2f} nm with {terms[1]:.0f} "
+        f"instead of {terms[0]:.0f} terms per scan"
+    )
+    return "; ".join(filter(None, (judgement.reason(), said)))
+
+
+def _frame(effect: str) -> str:
+    return line_terms(terms_of_effect(effect))[0].frame
+
+
+def _columns_of(names: Iterable[str], terms: Terms) -> list[int]:
+    """Columns of ``term_maps(…, terms)`` that belong to some of the terms."""
+    wanted = parameter_names(names)
+    return [at for at, name in enumerate(parameter_names(terms)) if name in wanted]

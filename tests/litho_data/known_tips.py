@@ -1,0 +1,54 @@
+"""Surfaces under tips of known radius, on a grid four times as fine as the scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.ndimage
+
+PITCH_UM = (0.1, 0.1)
+SIZE_PX = 160
+OVER = 4
+
+
+def print_under_tip(
+    kind: str, radius_um: float, height_um: float, seed: int = 11, size_px: int = SIZE_PX
+) -> tuple[np.ndarray, np.ndarray]:
+    """The image (size, size), µm, under a paraboloid, and per pixel the share that the tip touched."""
+    fine_um = PITCH_UM[0] / OVER
+    reach = int(np.ceil(np.sqrt(2 * radius_um * height_um) / fine_um)) + 1
+    parabola = -((np.arange(-reach, reach + 1) * fine_um) ** 2) / (2 * radius_um)
+
+    def dilated(heights: np.ndarray) -> np.ndarray:
+        for line in (parabola[:, None], parabola[None]):
+            heights = scipy.ndimage.grey_dilation(heights, size=line.shape, structure=line, mode="nearest")
+        return heights
+
+    surface = fine_surface(kind, height_um, seed, size_px)
+    image = dilated(surface)
+    # A contact between two points of the fine grid leaves the surface by up to fine²/2R there.
+    touched = -dilated(-image) - surface < 2 * fine_um**2 / radius_um
+    share = touched.reshape(size_px, OVER, size_px, OVER).mean(axis=(1, 3))
+    return image[OVER // 2 :: OVER, OVER // 2 :: OVER], share
+
+
+def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX) -> np.ndarray:
+    """Pillars of one height, spikes or bumps of several, µm, OVER times as fine as the scan."""
+    rng, size = np.random.default_rng(seed), size_px * OVER
+    surface = np.zeros((size, size))
+    for _ in range(size_px**2 // 2000):
+        y, x = rng.uniform(0, size, 2)
+        b, a = rng.uniform(2, 14, 2) * OVER
+        if kind == "pillars":
+            surface[max(int(y - b / 2), 0) : int(y + b / 2), max(int(x - a / 2), 0) : int(x + a / 2)] = (
+                height_um
+            )
+            continue
+        width = b / (12 if kind == "spikes" else 3)
+        rows, columns = (np.exp(-((np.arange(size) - at) ** 2) / (2 * width**2)) for at in (y, x))
+        np.maximum(surface, rng.uniform(0.4, 1) * height_um * np.outer(rows, columns), out=surface)
+    return surface
+
+
+def noise_of_snr(shape: tuple[int, ...], height_um: float, snr: float, seed: int) -> np.ndarray:
+    """White noise, µm."""
+    return np.random.default_rng(seed + 1).standard_normal(shape) * height_um / snr

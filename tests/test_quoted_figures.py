@@ -1,0 +1,241 @@
+"""Figures that pages quote in their text are those of the committed records."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def reliefs(record: dict[str, Any]) -> list[str]:
+    def span(relief: str, arm: str) -> str:
+        values = [row[f"{arm}_nm"] for row in record["rows"] if row["relief"] == relief]
+        return f"{min(values):.1f} to {max(values):.1f} nm"
+
+    return [
+        f"| {name} | {span(name, 'affine')} | {span(name, 'corrected')} | {span(name, 'second')} |"
+        for name in ("blaze", "staircase")
+    ] + [f"| {span('lens', 'affine')} | {span('lens', 'corrected')} | {span('lens', 'second')} |"]
+
+
+def photographs(record: dict[str, Any]) -> list[str]:
+    errors = np.array([row["error_db"] for row in record["rows"] if "error_db" in row])
+    faulty = [row for row in record["rows"] if row["fault"]]
+    unsaid = [row["silent"] for row in record["rows"] if "silent" in row]
+    assert all("refused" in row for row in faulty)
+    assert not any(unsaid)
+    assert (np.abs(errors) > 0.3).sum() == 1
+    return [
+        f"Of {len(record['rows'])} photographs of simulated prints, {len(errors)} were scored",
+        f"off by −{-errors.min():.2f} to +{errors.max():.2f} dB (rms {np.sqrt((errors**2).mean()):.2f} dB)",
+        f"{len(record['rows']) - len(errors)} were refused, among them all {len(faulty)} with",
+        f"None of {len(unsaid)} mirrored or turned ones",
+    ]
+
+
+def solids(record: dict[str, Any]) -> list[str]:
+    rows = record["rows"]
+    closed = sum(row["trimesh_closed"] and row["numpy_stl_closed"] for row in rows)
+
+    def span(levels: str, places: int) -> str:
+        sizes = [row["megabytes"] for row in rows if row["levels"] == levels]
+        return f"{min(sizes):.{places}f} to {max(sizes):.{places}f} MB"
+
+    return [f"{closed} of {len(rows)} files were closed", f"takes {span('zoo:physics', 0)}"]
+
+
+def mixed_up(record: dict[str, Any]) -> list[str]:
+    cases = record["cases"]
+    named = sum(set(case["touched"]) <= set(case["named"]) for case in cases)
+    assert not any(case["false"] or case["false_before"] for case in cases)
+    return [f"{named} of {len(cases)} mistakes were named"]
+
+
+def alarms(record: dict[str, Any]) -> list[str]:
+    boards = [one for board in record["virtual"].values() for one in board["references"].items()]
+    false = [one["false_alarms"] for _, one in boards]
+    noticed = {n: [one["noticed"] / 10 for count, one in boards if count == n] for n in ("12", "24", "48")}
+    # Of 100 unchanged sets one may alarm.
+    assert max(false) <= 10
+    return [
+        f"raised {min(false)} to {max(false)} false alarms",
+        f"in {min(noticed['48']):.0f} to {max(noticed['48']):.0f} % of the sets with 48",
+        f"in {np.mean(noticed['24']):.0f} % with 24 and in {min(noticed['12']):.0f} to "
+        f"{max(noticed['12']):.0f} % with 12",
+    ]
+
+
+def warps(record: dict[str, Any]) -> list[str]:
+    defects = [case["error_px"] for case in record["defects"] if case["what"] != "clean"]
+    creep = [case["error_px"] for case in record["creep"]]
+    return [
+        f"{min(defects):.3f} to {max(defects):.3f} px",
+        f"it leaves {min(creep):.2f} to {max(creep):.2f} px",
+    ]
+
+
+def tips(record: dict[str, Any]) -> list[str]:
+    reaching = [case for case in record["cases"] if case["radius_um"] > 0.1]
+    estimates = [ratio for case in reaching for ratio in case["estimates"]]
+    bounds = [ratio for case in reaching for ratio in case["bounds"]]
+    assert all(abs(ratio - 1) <= 0.1 for ratio in estimates)
+    assert all(ratio >= 1 for ratio in bounds)
+    lowest = min(share for case in reaching for share in case["untouched_uncertain"])
+    return [
+        f"all {len(estimates)} estimates are within 10 %, and all {len(bounds)} bounds hold",
+        f"At least {100 * lowest:.0f} % of the untouched pixels",
+    ]
+
+
+def uncertainties(record: dict[str, Any]) -> list[str]:
+    large = [one for one in record["conditions"] if not one["what"].startswith("256")]
+    worst = next(one for one in record["conditions"] if one["what"].startswith("256 px, tilt and bow"))
+    ratios, shares = [one["sd"] for one in large], [100 * one["within_68"] for one in large]
+    return [
+        f"deviation of {min(ratios):.2f} to {max(ratios):.2f}",
+        f"{min(shares):.0f} to {max(shares):.0f} % of the pixels lie within 1 σ",
+        f"it is {worst['sd']:.2f}, and a single scan was off by {max(worst['sd_of_scans']):.1f} σ",
+    ]
+
+
+def readers(record: dict[str, Any]) -> list[str]:
+    files, bodies = record["files"], record["bodies"]["signatures"]
+    assert sum(one.get("refused", 0) for one in bodies) == 50_000
+    slowest = max(one["longest_s"] for one in bodies)
+    return [
+        f"Of {len(files)} files from other programs {sum(not one['refused'] for one in files)} were read",
+        f"50,000 random bodies behind {len(bodies)} signatures were all refused; the slowest took "
+        f"{slowest:.1f} s",
+    ]
+
+
+def weights(record: dict[str, Any]) -> list[str]:
+    assert all(abs(one["difference_nm"]) < 0.01 for one in record["models"])
+    return ["differ by less than 0.01 nm"]
+
+
+def workers(record: dict[str, Any]) -> list[str]:
+    one, two = (next(run for run in record["runs"] if run["workers"] == n) for n in (1, 2))
+    minutes = [10 * run["wall_s"] / 60 for run in (one, two)]
+    return [
+        f"took {one['wall_s']:.0f} s with one worker and {two['wall_s']:.0f} s with two, "
+        f"{one['wall_s'] / two['wall_s']:.2f} × as fast",
+        f"10,000 scans take {minutes[0]:.0f} and {minutes[1]:.0f} min",
+        f"from {one['worker_mib']['0.1']:.0f} to {one['worker_mib']['1.0']:.0f} MiB",
+    ]
+
+
+def large(record: dict[str, Any]) -> list[str]:
+    small, middle, last = record["measured"]
+    return [
+        f"an iteration takes {small['iteration_s']:.1f} s at 1,024 px, {middle['iteration_s']:.1f} s at "
+        f"2,048 and {last['iteration_s']:.1f} s at 4,096 ({last['peak_memory_gib']:.2f} GiB)",
+        f"{-100 * record['error']['iteration_s']:.0f} % (PBL) too short",
+    ]
+
+
+def papers_search(record: dict[str, Any]) -> list[str]:
+    digits = {
+        "hoe": ("si_psnr_db", 2),
+        "lens-direct": ("cbr", 0),
+        "lens-computational": ("mae_calibrated", 4),
+    }
+    rows = []
+    for arm, title in (("none", "none"), ("physics", "Physics"), ("fno", "FNO")):
+        cells = []
+        for task, (figure, places) in digits.items():
+            for search in ("paper", "ours"):
+                summary = record["tasks"][f"{task}-{search}-333"]["summary"]
+                (found,) = [
+                    one
+                    for one in summary
+                    if (one["arm"], one["judge"], one["figure"]) == (arm, "fab", figure)
+                ]
+                cells.append(f"{found['judged_mean']:.{places}f}")
+        rows.append(f"| {title} | {' | '.join(cells)} |")
+    return rows
+
+
+def quadrants(record: dict[str, Any]) -> list[str]:
+    affine, _, seven = record["bounds"][:3]
+    prints = np.array(list(affine["datum_of_prints_nm"].values()))
+    return [
+        f"zeros of {affine['datum_size']['mean_nm']:.0f} nm in the mean",
+        f"{prints[:4].mean():.0f} nm too high in the four prints",
+        f"{-prints[4:].mean():.0f} nm too low in the two",
+        f"zeros of {seven['datum_size']['mean_nm']:.0f} nm on prints they were not fitted to, and errors of "
+        f"{seven['mae']['mean_nm']:.0f} nm",
+    ]
+
+
+QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
+    "relief/relief.json": ("optics.md", reliefs),
+    "photographs/photographs.json": ("scores.md", photographs),
+    "stl/stl.json": ("export.md", solids),
+    "mixed-up/mixed_up.json": ("own_data.md", mixed_up),
+    "drift-alarm/drift_alarm.json": ("checking.md", alarms),
+    "registration/registration.json": ("registration.md", warps),
+    "tip/tip.json": ("roughness.md", tips),
+    "height-sigma/height_sigma.json": ("dataset_store.md", uncertainties),
+    "readers/readers.json": ("readers.md", readers),
+    "neural-lithography/weights.json": ("evaluation.md", weights),
+    "build/cluster.json": ("cluster.md", workers),
+    "large/pbl.json": ("large.md", large),
+    "gap/paper_search.json": ("gap.md", papers_search),
+    "paper/pairs.json": ("paper.md", quadrants),
+}
+
+
+@pytest.mark.parametrize("file", QUOTED)
+def test_a_page_quotes_its_record(file):
+    page, said = QUOTED[file]
+    text = " ".join((DOCS / page).read_text("utf-8").split())
+    assert f"](results/{file})" in text
+    assert [
+        one for one in said(json.loads((DOCS / "results" / file).read_text("utf-8"))) if one not in text
+    ] == []
+
+
+def test_the_results_page_quotes_the_draws_of_the_papers_split_and_the_seeds():
+    folder = DOCS / "results" / "neural-lithography"
+    text = " ".join((folder / "README.md").read_text("utf-8").split())
+
+    def errors_nm(file: str) -> dict[str, float]:
+        scores = json.loads((folder / file).read_text("utf-8"))["scores"]
+        return {score["model"]: score["mae_datum_free_nm"] for score in scores}
+
+    draws = [errors_nm(f"benchmark_paper_{draw}.json") for draw in range(4)]
+    low, high = ({name: end(draw[name] for draw in draws) for name in draws[0]} for end in (min, max))
+    assert (
+        f"FNO has {low['fno']:.2f} to {high['fno']:.2f} nm, PBL {low['pbl']:.2f} to {high['pbl']:.2f}" in text
+    )
+    assert f"Physics {low['physics']:.2f} to {high['physics']:.2f} nm" in text
+    ahead = [draw["pbl"] - draw["fno"] for draw in draws]
+    assert f"ahead of PBL by {min(ahead):.2f} to {max(ahead):.2f} nm in all four draws" in text
+    prints = errors_nm("benchmark_prints.json") | errors_nm("benchmark_prints_pbl.json")
+    shown = {"PBL": "pbl", "`features`": "features", "`linear`": "linear", "Physics": "physics"}
+    for name, model in shown.items():
+        assert f"{name} {prints[model]:.2f}" in text
+
+
+def test_the_page_on_training_quotes_the_recipes():
+    text = " ".join((DOCS / "evaluation.md").read_text("utf-8").split())
+    folder = DOCS / "results" / "recipes"
+
+    def error_nm(file: Path, model: str) -> float:
+        scores = json.loads(file.read_text("utf-8"))["scores"]
+        return next(score["mae_datum_free_nm"] for score in scores if score["model"] == model)
+
+    pbl, fno, physics = (
+        error_nm(folder / f"paper-{one}" / "benchmark.json", one) for one in ("pbl", "fno", "physics")
+    )
+    assert f"PBL {pbl:.2f} nm, FNO {fno:.2f} nm and Physics {physics:.2f} nm" in text
+    fast = DOCS / "results" / "neural-lithography" / "benchmark_paper_0.json"
+    pbl, fno, physics = (error_nm(fast, one) for one in ("pbl", "fno", "physics"))
+    assert f"{pbl:.2f}, {fno:.2f} and {physics:.2f} nm" in text
