@@ -10,7 +10,7 @@ import typer
 from litho_data.cli.layouts import masks, simulate
 from litho_data.cli.scan import inspect, level
 from litho_data.cli.tip import tip
-from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
+from litho_data.foundation.app import DaskOption, WorkersOption, argument, new_app, option, run_app
 
 app = new_app(
     "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
@@ -21,14 +21,12 @@ app.command()(inspect)
 app.command()(level)
 app.command()(tip)
 
-StorePath = Annotated[Path, typer.Argument(help="dataset store, a .zarr folder or .zarr.zip file")]
+StorePath = Annotated[Path, argument("dataset store, a .zarr folder or .zarr.zip file")]
 DataDir = Annotated[
     Path | None,
-    typer.Option(
-        help="folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"
-    ),
+    option("folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"),
 ]
-Strict = Annotated[bool, typer.Option("--strict", help="do not build if a scan is skipped or has no partner")]
+Strict = Annotated[bool, option("do not build if a scan is skipped or has no partner", "--strict")]
 
 
 class Format(StrEnum):
@@ -41,10 +39,8 @@ class Format(StrEnum):
 
 @app.command()
 def fetch(
-    name: Annotated[
-        str, typer.Argument(help="a dataset of this project, e.g. neural-lithography, or a card's path")
-    ],
-    into: Annotated[Path | None, typer.Option(help="folder to fill; by default the user cache")] = None,
+    name: Annotated[str, argument("a dataset of this project, e.g. neural-lithography, or a card's path")],
+    into: Annotated[Path | None, option("folder to fill; by default the user cache")] = None,
 ) -> None:
     """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256.
 
@@ -57,17 +53,15 @@ def fetch(
 
 @app.command()
 def build(
-    card: Annotated[Path, typer.Argument(help="dataset card (TOML)")],
-    out: Annotated[
-        Path, typer.Option(help="store to write, e.g. prints.zarr; an older store there is replaced")
-    ],
+    card: Annotated[Path, argument("dataset card (TOML)")],
+    out: Annotated[Path, option("store to write, e.g. prints.zarr; an older store there is replaced")],
     data_dir: DataDir = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     strict: Strict = False,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
+    seed: Annotated[int, option("seed of the robust registration", min=0)] = 0,
     suggest: Annotated[
-        bool, typer.Option("--suggest", help="compare levelling recipes on three scans; build nothing")
+        bool, option("compare levelling recipes on three scans; build nothing", "--suggest")
     ] = False,
     tip: Annotated[
         str | None,
@@ -116,7 +110,7 @@ def build(
 
 @app.command()
 def calibrate(
-    card: Annotated[Path, typer.Argument(help="dataset card (TOML) with a `calibration` table")],
+    card: Annotated[Path, argument("dataset card (TOML) with a `calibration` table")],
     data_dir: DataDir = None,
 ) -> None:
     """Measure the card's gratings and step, and show the scales that a build would apply.
@@ -153,7 +147,7 @@ def verify(store: StorePath, data_dir: DataDir = None) -> None:
 @app.command()
 def history(
     store: StorePath,
-    scan: Annotated[str | None, typer.Argument(help="id of a scan; without it, one line per scan")] = None,
+    scan: Annotated[str | None, argument("id of a scan; without it, one line per scan")] = None,
 ) -> None:
     """Print where the arrays of a scan come from: files, operations, parameters, hashes.
 
@@ -167,10 +161,8 @@ def history(
 @app.command()
 def replay(
     store: StorePath,
-    scan: Annotated[list[str] | None, typer.Argument(help="ids of scans; without, all")] = None,
-    array: Annotated[
-        list[str] | None, typer.Option(help="name of an array, e.g. height_um; repeatable")
-    ] = None,
+    scan: Annotated[list[str] | None, argument("ids of scans; without, all")] = None,
+    array: Annotated[list[str] | None, option("name of an array, e.g. height_um; repeatable")] = None,
     data_dir: DataDir = None,
 ) -> None:
     """Compute arrays again from the raw files and report the largest difference from the store.
@@ -187,12 +179,8 @@ def replay(
 @app.command()
 def export(
     store: StorePath,
-    format: Annotated[
-        Format, typer.Option(help="one file, the authors' 8-bit pairs, or a self-describing release")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="file (zip) or folder to write; by default beside the store")
-    ] = None,
+    format: Annotated[Format, option("one file, the authors' 8-bit pairs, or a self-describing release")],
+    out: Annotated[Path | None, option("file (zip) or folder to write; by default beside the store")] = None,
 ) -> None:
     """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder.
 
@@ -218,12 +206,12 @@ def export(
 
 @app.command("import-pairs")
 def import_pairs(
-    folder: Annotated[Path, typer.Argument(help="folder with mask/, afm/ and src_max_dict.txt")],
-    out: Annotated[Path | None, typer.Option(help="store to write; by default FOLDER.zarr")] = None,
-    pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
-    level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
-    levels: Annotated[int, typer.Option(help="number of levels of the layouts")] = 13,
-    name: Annotated[str | None, typer.Option(help="name of the dataset; by default the folder's")] = None,
+    folder: Annotated[Path, argument("folder with mask/, afm/ and src_max_dict.txt")],
+    out: Annotated[Path | None, option("store to write; by default FOLDER.zarr")] = None,
+    pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
+    level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,
+    levels: Annotated[int, option("number of levels of the layouts")] = 13,
+    name: Annotated[str | None, option("name of the dataset; by default the folder's")] = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     strict: Strict = False,

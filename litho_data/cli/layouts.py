@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from litho_data.foundation.app import option
+
 
 def _list_patterns(wanted: bool) -> None:
     if wanted:
@@ -26,24 +28,22 @@ def _list_knobs(wanted: bool) -> None:
 
 
 def masks(
-    out: Annotated[Path, typer.Option(help="folder to write; an older set of these settings is replaced")],
-    pattern: Annotated[
-        str, typer.Option(help="random, or a calibration pattern: see --list-patterns")
-    ] = "random",
-    count: Annotated[int, typer.Option(min=1, help="number of random layouts")] = 12,
-    size_px: Annotated[int, typer.Option(min=8, help="side of a layout")] = 512,
-    levels: Annotated[int, typer.Option(min=2, max=256, help="number of levels, 0 … levels − 1")] = 13,
-    cutoff_per_um: Annotated[float, typer.Option(help="low-pass cut-off, cycles/µm")] = 0.25,
-    passband: Annotated[str, typer.Option(help="square (as the measured layouts) or round")] = "square",
+    out: Annotated[Path, option("folder to write; an older set of these settings is replaced")],
+    pattern: Annotated[str, option("random, or a calibration pattern: see --list-patterns")] = "random",
+    count: Annotated[int, option("number of random layouts", min=1)] = 12,
+    size_px: Annotated[int, option("side of a layout", min=8)] = 512,
+    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=256)] = 13,
+    cutoff_per_um: Annotated[float, option("low-pass cut-off, cycles/µm")] = 0.25,
+    passband: Annotated[str, option("square (as the measured layouts) or round")] = "square",
     quantiser: Annotated[
-        str, typer.Option(help="round (the paper's equation) or floor (as the published layouts)")
+        str, option("round (the paper's equation) or floor (as the published layouts)")
     ] = "round",
     field_px: Annotated[
-        int | None, typer.Option(help="side of a larger field that random layouts are cut from, pixels")
+        int | None, option("side of a larger field that random layouts are cut from, pixels")
     ] = None,
-    pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
-    level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
+    pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
+    level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,
+    seed: Annotated[int, option("seed of every random draw", min=0)] = 0,
     list_patterns: Annotated[
         bool,
         typer.Option(
@@ -77,43 +77,37 @@ def masks(
 def simulate(
     out: Annotated[
         Path,
-        typer.Option(help="folder to write (raw/ and truth/); an older run of these settings is replaced"),
+        option("folder to write (raw/ and truth/); an older run of these settings is replaced"),
     ],
-    preset: Annotated[str, typer.Option(help="plain, demo, measured-like or second-printer")] = "plain",
-    layouts: Annotated[
-        Path | None, typer.Option(help="print the layouts of this card instead of random ones")
-    ] = None,
+    preset: Annotated[str, option("plain, demo, measured-like or second-printer")] = "plain",
+    layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
     plan: Annotated[
         Path | None,
-        typer.Option(help="print and scan the plan in this folder (litho-models next-print), beside --fab"),
+        option("print and scan the plan in this folder (litho-models next-print), beside --fab"),
     ] = None,
     fab: Annotated[
         Path | None,
-        typer.Option(help="earlier run (raw/ and truth/) whose machine prints the plan; give a new --seed"),
+        option("earlier run (raw/ and truth/) whose machine prints the plan; give a new --seed"),
     ] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="number of scans; by default the preset's")] = None,
-    size_px: Annotated[
-        int | None, typer.Option(min=32, help="side of a layout; by default the preset's")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
+    count: Annotated[int | None, option("number of scans; by default the preset's", min=1)] = None,
+    size_px: Annotated[int | None, option("side of a layout; by default the preset's", min=32)] = None,
+    seed: Annotated[int, option("seed of every random draw", min=0)] = 0,
     knob: Annotated[
         list[str] | None,
-        typer.Option(help="an effect, name=strength or name=strength@seed; repeatable; --list-knobs"),
+        option("an effect, name=strength or name=strength@seed; repeatable; --list-knobs"),
     ] = None,
-    noise: Annotated[str, typer.Option(help="default or off")] = "default",
-    microscope: Annotated[str, typer.Option(help="default (small warps) or aligned (none)")] = "default",
+    noise: Annotated[str, option("default or off")] = "default",
+    microscope: Annotated[str, option("default (small warps) or aligned (none)")] = "default",
     write_field_um: Annotated[
-        float | None, typer.Option(help="side of a write field shared by a print's fields, µm")
+        float | None, option("side of a write field shared by a print's fields, µm")
     ] = None,
     stitch_field_um: Annotated[
-        float | None, typer.Option(help="side of the fields that the knob stitching displaces, µm")
+        float | None, option("side of the fields that the knob stitching displaces, µm")
     ] = None,
     references: Annotated[
-        bool, typer.Option("--references", help="add scans of a bare substrate, a flat and a 5-step print")
+        bool, option("add scans of a bare substrate, a flat and a 5-step print", "--references")
     ] = False,
-    metadata: Annotated[
-        str, typer.Option(help="full, or files-only (no order, positions, write axis)")
-    ] = "full",
+    metadata: Annotated[str, option("full, or files-only (no order, positions, write axis)")] = "full",
     list_knobs: Annotated[
         bool,
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),

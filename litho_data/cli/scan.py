@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from litho_data.foundation.app import argument, option
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX
 from litho_data.readers.registry import formats
@@ -18,21 +19,21 @@ if TYPE_CHECKING:
     from litho_data.scan import Scan
 
 
-ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")]
-Format = Annotated[str, typer.Option(help=f"auto (by the content of the file), {', '.join(formats())}")]
-Unit = Annotated[str | None, typer.Option(help="unit of the heights if the file states none, e.g. m, nm")]
+ScanPath = Annotated[Path, argument("a scan in any supported format")]
+Format = Annotated[str, option(f"auto (by the content of the file), {', '.join(formats())}")]
+Unit = Annotated[str | None, option("unit of the heights if the file states none, e.g. m, nm")]
 Size = Annotated[
     YX | None,
     typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
 ]
-ChannelName = Annotated[str | None, typer.Option(help="name of the height channel, if there are several")]
+ChannelName = Annotated[str | None, option("name of the height channel, if there are several")]
 Missing = Annotated[
     list[str] | None,
-    typer.Option(help="number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
+    option("number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
 ]
 FullScale = Annotated[
     float | None,
-    typer.Option("--full-scale-um", help="height in µm of the largest value of an integer image"),
+    option("height in µm of the largest value of an integer image", "--full-scale-um"),
 ]
 
 
@@ -43,8 +44,8 @@ def marks(texts: list[str] | None) -> list[float | str] | None:
 
 def level(
     scan: ScanPath,
-    recipe: Annotated[Path, typer.Option(help="levelling recipe (TOML)")],
-    out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
+    recipe: Annotated[Path, option("levelling recipe (TOML)")],
+    out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     format: Format = "auto",
     unit: Unit = None,
     size_um: Size = None,
@@ -86,8 +87,8 @@ def inspect(
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
     missing: Missing = None,
-    picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
-    header: Annotated[bool, typer.Option("--header", help="print the full header of the file")] = False,
+    picture: Annotated[Path | None, option("PNG to write")] = None,
+    header: Annotated[bool, option("print the full header of the file", "--header")] = False,
 ) -> None:
     """List the channels of a file with sizes, units and pitch, and show the heights.
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from litho_data.cli.scan import ChannelName, Format, FullScale, Size, Unit
+from litho_data.foundation.app import argument, option
 from litho_data.foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,16 +16,16 @@ if TYPE_CHECKING:
 
 
 def tip(
-    scans: Annotated[list[Path], typer.Argument(help="one scan, or all scans of one tip, of the same pitch")],
+    scans: Annotated[list[Path], argument("one scan, or all scans of one tip, of the same pitch")],
     format: Format = "auto",
     unit: Unit = None,
     size_um: Size = None,
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
-    json: Annotated[bool, typer.Option("--json", help="print the whole result as JSON")] = False,
+    json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,
-        typer.Option(help="folder for NAME.certain.npy (true where the tip touched) and NAME.surface.gsf"),
+        option("folder for NAME.certain.npy (true where the tip touched) and NAME.surface.gsf"),
     ] = None,
 ) -> None:
     """Estimate the radius of the tip, or the most that it can be, and where it did not touch.

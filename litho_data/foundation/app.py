@@ -18,6 +18,18 @@ from litho_data.foundation.run_facts import running_command
 
 # Typer does not export it under a name of its own: what its errors of usage are derived from.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+
+def option(help: str, *names: str, **more: Any) -> Any:
+    """An option of a command: what it is, its names where these are others, and what else typer takes."""
+    return typer.Option(*names, help=help, **more)
+
+
+def argument(help: str) -> Any:
+    """An argument of a command."""
+    return typer.Argument(help=help)
+
+
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
 WorkersOption = Annotated[
@@ -25,9 +37,9 @@ WorkersOption = Annotated[
 ]
 DaskOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "address of a Dask scheduler, such as tcp://host:8786: its workers in the place of --workers",
         "--dask",
-        help="address of a Dask scheduler, such as tcp://host:8786: its workers in the place of --workers",
     ),
 ]
 

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import YX, Shape
+from litho_data.foundation.kinds import Shape
 from litho_data.layouts.card_text import CARD_NAME, CardText, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
@@ -116,21 +116,38 @@ def simulate(
             part.mkdir(parents=True)
         rows: list[tuple[object, ...]] = []
         scans: list[ScanTruth] = []
-        size_um = (0.0, 0.0)
-        grating_um: float | None = None
         for job in progress(source, "printing and scanning", total):
             scan = scan_job(fab, job)
             write_layout(raw, job.id, job.level)
             _write_scan(raw / "scans" / job.id, scan, fab.microscope)
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
-            size_um = scan.frame.size_um
-            write_field_um, grating_um = job.write_field_um, job.grating_um
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
-        _write_card(
-            raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern, grating_um
+        card = CardText(
+            name=name,
+            title="Simulated two-photon prints with simulated AFM scans",
+            pitch_um=fab.printer.pitch_um,
+            level_height_um=fab.printer.level_height_um,
+            levels=fab.printer.levels,
+            scan_size_um=scan.frame.size_um,
+            table=metadata == "full",
+            plan_of=plan_of,
+            scan_format=fab.microscope.files,
+            # Tilt and bow are among the effects that are planted.
+            levelled=True,
         )
+        if card.table:
+            _write_table(raw, rows)
+            in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
+            card = replace(
+                card,
+                print_pattern=print_pattern if in_prints else "",
+                slow_axis="y",
+                write_field_um=job.write_field_um,
+                grating_um=job.grating_um,
+            )
+        card.write(raw)
         Truth(**facts, scans=scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
 
@@ -182,41 +199,11 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
         raise InputError("level in a layout", got=highest, wanted=f"0 to {printer.levels - 1}")
 
 
-def _write_card(
-    raw: Path,
-    fab: Fab,
-    name: str,
-    size_um: YX,
-    rows: list[tuple[object, ...]],
-    metadata: str,
-    write_field_um: float | None,
-    plan_of: str,
-    print_pattern: str,
-    grating_um: float | None,
-) -> None:
-    full = metadata == "full"
-    in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
-    if full:
-        ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
-        columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
-        write_table(raw, columns, [row[: len(columns)] for row in rows])
-    CardText(
-        name=name,
-        title="Simulated two-photon prints with simulated AFM scans",
-        pitch_um=fab.printer.pitch_um,
-        level_height_um=fab.printer.level_height_um,
-        levels=fab.printer.levels,
-        scan_size_um=size_um,
-        print_pattern=print_pattern if full and in_prints else "",
-        table=full,
-        plan_of=plan_of,
-        scan_format=fab.microscope.files,
-        slow_axis="y" if full else "",
-        write_field_um=write_field_um if full else None,
-        grating_um=grating_um if full else None,
-        # Tilt and bow are among the effects that are planted.
-        levelled=True,
-    ).write(raw)
+def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
+    """The card's table; how a scan was made stands in it where one was made otherwise."""
+    ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
+    columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
+    write_table(raw, columns, [row[: len(columns)] for row in rows])
 
 
 def _scan_truth(scan: FabScan) -> ScanTruth:
