@@ -20,13 +20,13 @@ from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
+from litho_models.loop.saving import MODEL_FOLDER
 from litho_models.planning.folder import HOLDS
 from litho_models.planning.layouts import as_tensor
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
 from litho_models.planning.report import prints_figure
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
-from litho_models.twin.saving import MODEL_FOLDER
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "next-print"

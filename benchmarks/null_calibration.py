@@ -28,10 +28,10 @@ from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.layouts import random_layout
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
+from litho_models.loop.closing import close
+from litho_models.loop.fits import Study
+from litho_models.loop.run import dealt
 from litho_models.models import build_model
-from litho_models.twin.closing import close
-from litho_models.twin.fits import Study
-from litho_models.twin.run import dealt
 
 PAGE = Path(__file__).parents[1] / "docs" / "closing_the_loop.md"
 RESULT = PAGE.parent / "results" / "null-calibration" / "null_calibration.json"

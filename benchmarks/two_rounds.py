@@ -29,14 +29,14 @@ from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
+from litho_models.loop.closing import Closed
+from litho_models.loop.record import CloseLoop, Decision
+from litho_models.loop.run import close_loop
 from litho_models.planning.deciding import MICROSCOPE, PRINTER, decide
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import PlannedQuestion
 from litho_models.planning.run import next_print
-from litho_models.twin.closing import Closed
-from litho_models.twin.record import CloseLoop, Decision
-from litho_models.twin.run import close_loop
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "two-rounds"

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.foundation.report import Page
-from litho_models.twin.record import CloseLoop
+from litho_models.loop.record import CloseLoop
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"

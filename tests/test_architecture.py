@@ -28,8 +28,7 @@ ROOMS = {
     ),
     "litho_models": (
         "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
-        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "twin", "planning",
-        "cli",
+        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning", "cli",
     ),
     "litho_design": (
         "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from benchmarks.measured_causes import FOLDER, PAGE, texts
 from benchmarks.record import published
 from litho_models.evaluation.results import Benchmark
-from litho_models.twin.record import CloseLoop
+from litho_models.loop.record import CloseLoop
 
 
 def test_the_page_quotes_the_committed_record():

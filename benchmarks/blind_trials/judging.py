@@ -15,10 +15,10 @@ from litho_data.register.resample import resample_to_layout
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab import Job, Noise, scan_job
 from litho_models.effects import CATALOGUE
+from litho_models.loop.errors import error_rows
+from litho_models.loop.record import CloseLoop
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.groups import label_of
-from litho_models.twin.errors import error_rows
-from litho_models.twin.record import CloseLoop
 
 # A form that is right under the name of a family only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}

@@ -15,7 +15,7 @@ from benchmarks.blind_trials.records import Draw, Draws, Outcome, Planted, Trial
 from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
-from litho_models.twin.run import close_loop
+from litho_models.loop.run import close_loop
 
 
 def trial_folder(out: Path, number: int) -> Path:

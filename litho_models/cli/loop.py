@@ -57,7 +57,7 @@ def close_loop(
 
     Example: litho-models close-loop prints.zarr --out loop
     """
-    from litho_models.twin.report import decision_text, effect_text, verdict_text
+    from litho_models.loop.report import decision_text, effect_text, verdict_text
 
     result = litho_models.close_loop(
         stores[0],

@@ -20,6 +20,13 @@ from scipy.stats import f_oneway
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Role
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import Study
+from litho_models.loop.judging import CONFIRM_P, SMALLEST_SHARE
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision
+from litho_models.loop.single_scans import SingleScans
 from litho_models.planning.noise import left_nm
 from litho_models.planning.power import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.questions import OpenQuestions, Owner, Question
@@ -27,13 +34,6 @@ from litho_models.planning.rival_fits import fit_rivals
 from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
-from litho_models.twin.closing import Closed
-from litho_models.twin.fits import Study
-from litho_models.twin.judging import CONFIRM_P, SMALLEST_SHARE
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision
-from litho_models.twin.single_scans import SingleScans
 
 NONE: Decided = "none of them"
 UNSEEN: Decided = "not shown by these prints"

@@ -9,9 +9,9 @@ from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop.fits import ALL_FREE
+from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.scan_terms import freed_um
-from litho_models.twin.fits import ALL_FREE
-from litho_models.twin.prepared import PreparedScan, sample_border_px
 
 _TILE_PX = 64
 

@@ -19,19 +19,19 @@ from litho_models.effects import CATALOGUE, get_effect
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
+from litho_models.loop.closing import Closed, held_out_maps
+from litho_models.loop.fits import RULES
+from litho_models.loop.learner import Learner
+from litho_models.loop.model import Twin
+from litho_models.loop.record import CloseLoop
+from litho_models.loop.results import clustered_covariance, independent
+from litho_models.loop.screening import Candidate
+from litho_models.loop.search import WORTH_FITTING, Cause, separating
 from litho_models.planning.noise import left_nm, noise_spectrum
 from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival
 from litho_models.planning.rival_fits import fit_rivals
 from litho_models.scan_terms import line_terms, terms_of_effect
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.closing import Closed, held_out_maps
-from litho_models.twin.fits import RULES
-from litho_models.twin.learner import Learner
-from litho_models.twin.model import Twin
-from litho_models.twin.record import CloseLoop
-from litho_models.twin.results import clustered_covariance, independent
-from litho_models.twin.screening import Candidate
-from litho_models.twin.search import WORTH_FITTING, Cause, separating
 
 # Members of a set, or suspects: every pair of rivals is compared on every layout.
 _MOST_MEMBERS = 3

@@ -20,10 +20,10 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
 from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop.judging import CONFIRM_P
 from litho_models.planning.noise import NoiseSpectrum
 from litho_models.planning.questions import Question
 from litho_models.planning.rivalry import Contrast
-from litho_models.twin.judging import CONFIRM_P
 
 # A wrong name is given with this probability at most.
 Z_DECIDED = float(norm.isf(CONFIRM_P))

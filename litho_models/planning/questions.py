@@ -10,10 +10,10 @@ from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
 from litho_data.store.schema import DatasetId
+from litho_models.loop.model import Twin
+from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.planning.noise import NoiseSpectrum
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.model import Twin
-from litho_models.twin.run import QUESTIONS_FILE
 
 Kind = Literal["set", "suspects", "role", "per-scan", "lines", "fact"]
 Owner = Literal["printer", "microscope"]

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
-from litho_models.twin.fits import RULES, TwinProblem
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan
+from litho_models.loop.fits import RULES, TwinProblem
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:

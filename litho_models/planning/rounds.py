@@ -9,11 +9,11 @@ from typing import Any
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.loop import run
+from litho_models.loop.closing import Closed
+from litho_models.loop.record import CloseLoop
 from litho_models.planning.deciding import decide, with_decisions
 from litho_models.planning.open_questions import open_questions
-from litho_models.twin import run
-from litho_models.twin.closing import Closed
-from litho_models.twin.record import CloseLoop
 
 
 def close_loop(
@@ -24,12 +24,12 @@ def close_loop(
     report: Callable[[str], None] = lambda message: None,
     **settings: Any,
 ) -> CloseLoop:
-    """Close the loop on a store, ``twin.run.close_loop``, and write what it leaves open beside it.
+    """Close the loop on a store, ``loop.run.close_loop``, and write what it leaves open beside it.
 
     Args:
         new_prints: further stores of the same printer. What is found on the first store stays as it is; the
             new prints decide between the answers to what is open, see ``deciding``.
-        settings: of ``twin.run.close_loop``.
+        settings: of ``loop.run.close_loop``.
 
     Raises:
         InputError: as there; further stores of another printer, or with a turned scan whose card

@@ -17,6 +17,7 @@ from litho_data.foundation.outputs import require_replaceable_folder, require_sa
 from litho_data.foundation.run_facts import run_info
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
+from litho_models.loop.saving import MODEL_FOLDER
 from litho_models.planning.answers import of_others, of_rivals
 from litho_models.planning.designer import TURNED, choose, climbed, together
 from litho_models.planning.folder import HOLDS, schedule, write_plan
@@ -25,7 +26,6 @@ from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry
-from litho_models.twin.saving import MODEL_FOLDER
 
 # Prints on which the rivals are compared at last; the others are made of the same tiles.
 _JUDGED = 2

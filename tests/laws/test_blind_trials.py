@@ -69,9 +69,9 @@ from litho_data.foundation.workers import Workers
 from litho_data.store import PrintedScan, open_store
 from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
 from litho_data.virtual_fab.knobs import KnobBoard
+from litho_models.loop.record import Candidate, CloseLoop, Explained, FoundEffect, Strength
 from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
 from litho_models.scan_terms.measurement import MeasurementModel, SharedPart
-from litho_models.twin.record import Candidate, CloseLoop, Explained, FoundEffect, Strength
 from tests.litho_models.prints import make_scans, write_store
 
 EARLIER = pd.read_csv(RESULTS / "earlier.csv", keep_default_na=False)
@@ -143,7 +143,7 @@ def test_the_page_lists_all_forms():
 
 def test_the_drawing_reads_no_catalogue():
     """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
-    rooms = ("litho_models.effects", "litho_models.twin")
+    rooms = ("litho_models.effects", "litho_models.loop")
     code = (
         "import sys, benchmarks.blind_trials.draws, benchmarks.blind_trials.planting\n"
         f"print(*(m for m in sys.modules if m.startswith({rooms})))"

@@ -29,14 +29,14 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.front import efficiency_front
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
+from litho_models.loop.bases import choose_base
+from litho_models.loop.errors import HeldOut
+from litho_models.loop.search import _fitted
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.bases import choose_base
-from litho_models.twin.errors import HeldOut
-from litho_models.twin.search import _fitted
 from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
+from tests.litho_models.loop_scans import bare_state, planted, study_of
 from tests.litho_models.prints import make_scans, write_store
-from tests.litho_models.twin_scans import bare_state, planted, study_of
 
 distributed = pytest.importorskip("distributed")
 

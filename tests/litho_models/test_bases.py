@@ -16,22 +16,21 @@ from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.frozen.card import ModelCard
+from litho_models.loop import closing
+from litho_models.loop.bases import choose_base
+from litho_models.loop.closing import close
+from litho_models.loop.errors import HeldOut
+from litho_models.loop.fits import Study, fit_state
+from litho_models.loop.folded_base import FoldedBase, train_folds
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.run import close_loop
+from litho_models.loop.search import search
 from litho_models.models import build_model
 from litho_models.scan_terms import measurement
 from litho_models.scan_terms.groups import ALL
 from litho_models.simulator import Simulator
-from litho_models.twin import closing
-from litho_models.twin.bases import choose_base
-from litho_models.twin.closing import close
-from litho_models.twin.errors import HeldOut
-from litho_models.twin.fits import Study, fit_state
-from litho_models.twin.folded_base import FoldedBase, train_folds
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import prepare_scans
-from litho_models.twin.run import close_loop
-from litho_models.twin.search import search
-from tests.litho_models.prints import make_scans, write_store
-from tests.litho_models.twin_scans import (
+from tests.litho_models.loop_scans import (
     LEVEL_HEIGHT_UM,
     LEVELS,
     PITCH_UM,
@@ -40,6 +39,7 @@ from tests.litho_models.twin_scans import (
     study_of,
     with_heights,
 )
+from tests.litho_models.prints import make_scans, write_store
 
 LAW = "slope-x-power-1"
 STRENGTH = {"strength": 0.04}

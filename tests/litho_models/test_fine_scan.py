@@ -21,12 +21,12 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
+from litho_models.loop.prepared import prepare_scans
 from litho_models.planning.layouts import Limits, score
 from litho_models.planning.questions import Question
 from litho_models.planning.rivalry import Printing, Rivalry, Way
-from litho_models.twin.prepared import prepare_scans
+from tests.litho_models.loop_scans import base_model, blank_scans
 from tests.litho_models.test_next_print import first_layout, opened, rival, white
-from tests.litho_models.twin_scans import base_model, blank_scans
 
 FINE = Way(pixel_size=0.5)
 

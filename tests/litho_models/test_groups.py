@@ -9,8 +9,8 @@ import pytest
 
 from litho_data.store import PrintedScan, open_store
 from litho_models.scan_terms.groups import ALL, groupings, label_of
+from tests.litho_models.loop_scans import blank_scan
 from tests.litho_models.prints import make_scans, write_store
-from tests.litho_models.twin_scans import blank_scan
 
 
 def scans_of(*ids: str, **facts: object) -> list[PrintedScan]:

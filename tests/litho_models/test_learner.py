@@ -12,13 +12,13 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.ridge import feature_rows
+from litho_models.loop import learner as module
+from litho_models.loop.fits import Study
+from litho_models.loop.learner import Learner, Rest
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan
 from litho_models.models import build_model
-from litho_models.twin import learner as module
-from litho_models.twin.fits import Study
-from litho_models.twin.learner import Learner, Rest
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan
-from tests.litho_models.twin_scans import base_model, planted, study_of
+from tests.litho_models.loop_scans import base_model, planted, study_of
 
 NOISE_UM = 0.006
 Change = Callable[[PreparedScan, np.ndarray], np.ndarray]

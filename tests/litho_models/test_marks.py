@@ -10,10 +10,10 @@ import pytest
 
 from litho_data.register.bend import Bend
 from litho_data.store import PrintedScan
-from litho_models.twin.marks import marks, rounding_step_um, with_marks
-from litho_models.twin.prepared import prepare_scans
-from litho_models.twin.record import ScanFinding
-from tests.litho_models.twin_scans import blank_scans, with_heights
+from litho_models.loop.marks import marks, rounding_step_um, with_marks
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.record import ScanFinding
+from tests.litho_models.loop_scans import blank_scans, with_heights
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
 # A scan turned by 90 degrees has its lines along y.

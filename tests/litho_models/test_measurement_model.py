@@ -11,7 +11,7 @@ from numpy.polynomial import legendre
 
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.measurement import LEVELLED, MeasurementModel, SharedPart, learn_measurement
-from tests.litho_models.twin_scans import PITCH_UM, blank_scans, with_heights
+from tests.litho_models.loop_scans import PITCH_UM, blank_scans, with_heights
 
 COUNT, SIZE_PX, NOISE_UM = 8, 48, 0.004
 SIDE = np.linspace(-1, 1, SIZE_PX)

@@ -32,6 +32,12 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
+from litho_models.loop import bases, closing
+from litho_models.loop.closing import close
+from litho_models.loop.fits import RULES, Study, TwinProblem
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.record import CloseLoop, Decision, FoundEffect
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
@@ -48,14 +54,8 @@ from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.groups import ALL
 from litho_models.scan_terms.term import row_index
-from litho_models.twin import bases, closing
-from litho_models.twin.closing import close
-from litho_models.twin.fits import RULES, Study, TwinProblem
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.twin.record import CloseLoop, Decision, FoundEffect
+from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
 from tests.litho_models.prints import write_store
-from tests.litho_models.twin_scans import base_model, blank_scans, planted, study_of, with_heights
 
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
@@ -67,7 +67,7 @@ QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def model(effects: dict[str, dict[str, float]]) -> Twin:
-    """The base of ``twin_scans`` with effects."""
+    """The base of ``loop_scans`` with effects."""
     twin = Twin.of_base(base_model(), 1.2, 0.1)
     for name, values in effects.items():
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values(values)})

@@ -12,12 +12,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
-from litho_models.twin.closing import Closed
-from litho_models.twin.fits import fit_state, without_terms
-from litho_models.twin.model import Twin
-from litho_models.twin.planting import parse_planted, plant
-from litho_models.twin.search import search
-from tests.litho_models.twin_scans import base_model, planted, study_of
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import fit_state, without_terms
+from litho_models.loop.model import Twin
+from litho_models.loop.planting import parse_planted, plant
+from litho_models.loop.search import search
+from tests.litho_models.loop_scans import base_model, planted, study_of
 
 LAW = "slope-x-power-1"
 

@@ -16,14 +16,14 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects.chain import EffectChain
+from litho_models.loop.prepared import prepare_scans
 from litho_models.planning import designer
 from litho_models.planning.designer import SECOND_DOSE
 from litho_models.planning.layouts import as_tensor
 from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 from litho_models.planning.run import next_print
-from litho_models.twin.prepared import prepare_scans
+from tests.litho_models.loop_scans import base_model, blank_scans
 from tests.litho_models.test_next_print import closed_loop, slope_question
-from tests.litho_models.twin_scans import base_model, blank_scans
 
 PLAIN = (Way(),)
 

@@ -11,13 +11,13 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import get_effect
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.record import ScanFinding
+from litho_models.loop.single_scans import SingleScans
 from litho_models.scan_terms import SCAN_TERMS
 from litho_models.scan_terms.measurement import learn_measurement
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.twin.record import ScanFinding
-from litho_models.twin.single_scans import SingleScans
-from tests.litho_models.twin_scans import base_model, planted, study_of, with_heights
+from tests.litho_models.loop_scans import base_model, planted, study_of, with_heights
 
 # Offsets of lines need two blocks of 32 px and a gap as wide on either side of what they are judged on.
 SIZE_PX, SMALL_PX = 160, 64

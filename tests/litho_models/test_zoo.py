@@ -116,9 +116,9 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     from litho_data.store import open_store
     from litho_models.evaluation.results import Evaluation
     from litho_models.frozen.freezing import freeze
+    from litho_models.loop.bases import choose_base
+    from litho_models.loop.fits import Study
     from litho_models.noise.residuals import read_residuals
-    from litho_models.twin.bases import choose_base
-    from litho_models.twin.fits import Study
 
     name = zoo.list()[-1]
     named, there = f"zoo:{name}", zoo.folder(name)

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.store import PrintedScan
+from litho_models.loop.fits import State, Study, fit_state
+from litho_models.loop.model import Twin, Values
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.models import build_model
 from litho_models.simulator import Simulator
-from litho_models.twin.fits import State, Study, fit_state
-from litho_models.twin.model import Twin, Values
-from litho_models.twin.prepared import PreparedScan, prepare_scans
 
 PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 0.1, 13, 0.1
 FIELDS, BLUR_UM = 2, 0.25

@@ -8,10 +8,10 @@ from litho_data.store import Store
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
+from litho_models.loop.closing import Closed
+from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.record import CloseLoop
 from litho_models.simulator import Simulator
-from litho_models.twin.closing import Closed
-from litho_models.twin.folded_base import FoldedBase
-from litho_models.twin.record import CloseLoop
 
 MODEL_FOLDER, LAWS_FILE = "model", "laws.py"
 

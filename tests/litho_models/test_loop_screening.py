@@ -7,10 +7,10 @@ import pytest
 
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Parameter, of_development
+from litho_models.loop.fits import State, Study, fit_state
+from litho_models.loop.screening import PERMUTATIONS, Candidate, Screening, Trial, trials_of
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.fits import State, Study, fit_state
-from litho_models.twin.screening import PERMUTATIONS, Candidate, Screening, Trial, trials_of
-from tests.litho_models.twin_scans import bare_state, planted, study_of
+from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 LAW = "slope-x-power-1"
 EFFECTS = [get_effect(name) for name in (LAW, "height-power-2", "rising-slope-y", "place-map")]

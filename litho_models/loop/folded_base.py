@@ -10,7 +10,7 @@ from torch import nn
 from litho_data.foundation.commands import progress
 from litho_data.foundation.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
-from litho_models.twin.prepared import PreparedScan
+from litho_models.loop.prepared import PreparedScan
 
 # Where other processes train, it is sent to them.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]

@@ -9,15 +9,12 @@ import numpy as np
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.least_squares import Linearised, eliminated
-from litho_models.scan_terms.groups import ALL
-from litho_models.scoring.pairs import over_prints, over_scans
-from litho_models.simulator import Simulator
-from litho_models.twin.closing import Closed
-from litho_models.twin.fits import RULES, State
-from litho_models.twin.judging import FAMILY_P, FEWEST_SCANS
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan
-from litho_models.twin.record import (
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import RULES, State
+from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.record import (
     Candidate,
     CandidateVerdict,
     CloseLoop,
@@ -29,8 +26,11 @@ from litho_models.twin.record import (
     Strength,
     Verdict,
 )
-from litho_models.twin.screening import SMALLEST_RETAINED
-from litho_models.twin.search import Cause, separating
+from litho_models.loop.screening import SMALLEST_RETAINED
+from litho_models.loop.search import Cause, separating
+from litho_models.scan_terms.groups import ALL
+from litho_models.scoring.pairs import over_prints, over_scans
+from litho_models.simulator import Simulator
 
 _BASE_ABSORBS = 1e-2
 # Numbers whose estimates move together this much are known together only.

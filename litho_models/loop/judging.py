@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_models.loop.fits import Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
-from litho_models.twin.fits import Study
 
 FAMILY_P = 0.05
 # By chance alone seven gains out of seven come once in 128: below eight scans nothing is confirmed.

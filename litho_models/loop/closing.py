@@ -17,15 +17,15 @@ from litho_data.store import PrintedScan
 from litho_models.effects import Effect, screened_effects
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 from litho_models.fitting.least_squares import fit_least_squares
+from litho_models.loop.adequacy import reshaped_gain
+from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
+from litho_models.loop.judging import judge
+from litho_models.loop.learner import Learner, Rest
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.search import Cause, Found, search, untestable
+from litho_models.loop.search import describe as describe_rest
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
-from litho_models.twin.adequacy import reshaped_gain
-from litho_models.twin.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
-from litho_models.twin.judging import judge
-from litho_models.twin.learner import Learner, Rest
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.twin.search import Cause, Found, search, untestable
-from litho_models.twin.search import describe as describe_rest
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and

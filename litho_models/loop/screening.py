@@ -15,11 +15,11 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.fitting.least_squares import gram_inside, orthonormal
+from litho_models.loop.fits import ALL_FREE, State, Study
+from litho_models.loop.model import finished
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL, Labels
 from litho_models.scoring.statistics import sign_flips
-from litho_models.twin.fits import ALL_FREE, State, Study
-from litho_models.twin.model import finished
 
 # Of a direction's information, what must survive the projections for a test to mean anything.
 SMALLEST_RETAINED = 1e-5

@@ -17,13 +17,13 @@ from scipy.interpolate import BSpline
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.fitting.ridge import feature_rows
+from litho_models.loop.fits import ALL_FREE, Study
+from litho_models.loop.judging import SMALLEST_SHARE
+from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.statistics import interval
-from litho_models.twin.fits import ALL_FREE, Study
-from litho_models.twin.judging import SMALLEST_SHARE
-from litho_models.twin.prepared import PreparedScan, sample_border_px
 
 # All rows of all scans; with more scans each is thinned.
 _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360

@@ -12,12 +12,12 @@ from scipy.ndimage import find_objects, label
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE
+from litho_models.loop.judging import CONFIRM_P, SMALLEST_RMSE_NM
+from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.record import ScanFinding
 from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
-from litho_models.twin.judging import CONFIRM_P, SMALLEST_RMSE_NM
-from litho_models.twin.prepared import PreparedScan
-from litho_models.twin.record import ScanFinding
 
 # Heights closer than this share of their range are one value of a file that rounds in single precision.
 _SAME_VALUE, _OFF_COMB, _ON_COMB_SHARE = 1e-6, 0.05, 0.99

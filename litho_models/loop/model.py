@@ -14,10 +14,10 @@ from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
+from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.groups import ALL, label_of
 from litho_models.simulator import Simulator, is_small
-from litho_models.twin.folded_base import FoldedBase
-from litho_models.twin.prepared import PreparedScan
 
 Values = dict[str, dict[str, float]]
 # Of the usual size of a number: a step of its difference quotient, and how near a bound is on it.

@@ -14,10 +14,10 @@ import numpy as np
 
 from litho_data.foundation.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
+from litho_models.loop.fits import State, Study, fit_state
+from litho_models.loop.judging import FAMILY_P, Judgement, judge, told_apart
+from litho_models.loop.screening import SMALLEST_RETAINED, Candidate, Screening
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.fits import State, Study, fit_state
-from litho_models.twin.judging import FAMILY_P, Judgement, judge, told_apart
-from litho_models.twin.screening import SMALLEST_RETAINED, Candidate, Screening
 
 MOST_EFFECTS = 8
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.

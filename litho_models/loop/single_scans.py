@@ -15,6 +15,10 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import line_period
 from litho_models.effects import get_effect
+from litho_models.loop.fits import Study
+from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, judge
+from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.record import ScanFinding, Strength
 from litho_models.scan_terms import (
     SCAN_TERMS,
     Blocks,
@@ -29,10 +33,6 @@ from litho_models.scan_terms import (
     terms_of_effect,
 )
 from litho_models.scoring.statistics import by_print, one_sided_flip_p
-from litho_models.twin.fits import Study
-from litho_models.twin.judging import CONFIRM_P, GROUPED_P, Judgement, judge
-from litho_models.twin.prepared import PreparedScan
-from litho_models.twin.record import ScanFinding, Strength
 
 _DATUM: Terms = frozenset({"offset"})
 _SMOOTH: Terms = frozenset({"offset", "bow"})

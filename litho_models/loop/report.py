@@ -10,8 +10,8 @@ import numpy as np
 
 from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
+from litho_models.loop.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

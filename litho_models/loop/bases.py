@@ -14,12 +14,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.fitting import TrainingConfig, fit_in_cache
 from litho_models.frozen import zoo
+from litho_models.loop.fits import Study, fit_state
+from litho_models.loop.folded_base import train_folds
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import prepare_scans
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
-from litho_models.twin.fits import Study, fit_state
-from litho_models.twin.folded_base import train_folds
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import prepare_scans
 
 AUTO = "auto"
 # Bases that compete where none is asked for, the first one the form of the paper's physics.

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from litho_models.effects import CATALOGUE, get_effect
+from litho_models.loop.fits import Study, fit_state
+from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
+from litho_models.loop.model import Twin, Values
+from litho_models.loop.search import Found, same_change, search, separating, untestable
 from litho_models.models import build_model
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.fits import Study, fit_state
-from litho_models.twin.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
-from litho_models.twin.model import Twin, Values
-from litho_models.twin.search import Found, same_change, search, separating, untestable
-from tests.litho_models.twin_scans import bare_state, planted, study_of
+from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 CANDIDATES = [
     get_effect(name)

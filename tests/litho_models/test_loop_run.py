@@ -23,20 +23,20 @@ from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze
+from litho_models.loop import bases, closing, run
+from litho_models.loop.closing import Closed, close, freed_scans
+from litho_models.loop.errors import REPORTED, HeldOut, error_rows
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.record import CloseLoop, Explained
+from litho_models.loop.report import effect_text, measurement_text, verdict_text
+from litho_models.loop.results import _verdict, clustered_covariance
+from litho_models.loop.run import close_loop, dealt
+from litho_models.loop.saving import save_model
 from litho_models.scan_terms import measurement
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin import bases, closing, run
-from litho_models.twin.closing import Closed, close, freed_scans
-from litho_models.twin.errors import REPORTED, HeldOut, error_rows
-from litho_models.twin.model import Twin
-from litho_models.twin.prepared import prepare_scans
-from litho_models.twin.record import CloseLoop, Explained
-from litho_models.twin.report import effect_text, measurement_text, verdict_text
-from litho_models.twin.results import _verdict, clustered_covariance
-from litho_models.twin.run import close_loop, dealt
-from litho_models.twin.saving import save_model
+from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
-from tests.litho_models.twin_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 
 COUNT = 12
 BASE = "affine-mtf"

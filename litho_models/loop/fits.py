@@ -23,11 +23,11 @@ from litho_models.fitting.least_squares import (
     orthonormal,
     solve_damped,
 )
+from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.model import Placed, Twin, finished
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.groups import Labels, groupings
-from litho_models.twin.folded_base import FoldedBase
-from litho_models.twin.model import Placed, Twin, finished
-from litho_models.twin.prepared import PreparedScan, prepare_scans
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})

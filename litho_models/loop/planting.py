@@ -11,10 +11,10 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.effects import Effect, get_effect
-from litho_models.twin.closing import Closed
-from litho_models.twin.fits import without_terms
-from litho_models.twin.model import finished
-from litho_models.twin.record import Planted
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import without_terms
+from litho_models.loop.model import finished
+from litho_models.loop.record import Planted
 
 
 def parse_planted(text: str) -> tuple[Effect, float]:

@@ -17,19 +17,19 @@ from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.loop.bases import AUTO, choose_base
+from litho_models.loop.closing import Closed, close, fit_with_measurement
+from litho_models.loop.errors import HeldOut, error_rows
+from litho_models.loop.fits import Study
+from litho_models.loop.marks import marks, rounding_step_um, with_marks
+from litho_models.loop.model import is_refitted
+from litho_models.loop.planting import parse_planted, plant
+from litho_models.loop.record import CloseLoop, ErrorRow, Stage
+from litho_models.loop.report import write_report
+from litho_models.loop.results import record
+from litho_models.loop.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
+from litho_models.loop.single_scans import SingleScans
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
-from litho_models.twin.bases import AUTO, choose_base
-from litho_models.twin.closing import Closed, close, fit_with_measurement
-from litho_models.twin.errors import HeldOut, error_rows
-from litho_models.twin.fits import Study
-from litho_models.twin.marks import marks, rounding_step_um, with_marks
-from litho_models.twin.model import is_refitted
-from litho_models.twin.planting import parse_planted, plant
-from litho_models.twin.record import CloseLoop, ErrorRow, Stage
-from litho_models.twin.report import write_report
-from litho_models.twin.results import record
-from litho_models.twin.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
-from litho_models.twin.single_scans import SingleScans
 
 QUESTIONS_FILE = "open_questions.json"
 _FEWEST_PIXELS = 1024

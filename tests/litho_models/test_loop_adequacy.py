@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
+from litho_models.loop.adequacy import reshaped_gain
+from litho_models.loop.closing import FORM_SHARE, Checked, _larger
+from litho_models.loop.fits import Study, fit_state
+from litho_models.loop.judging import judge
+from litho_models.loop.search import Cause, Found
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.adequacy import reshaped_gain
-from litho_models.twin.closing import FORM_SHARE, Checked, _larger
-from litho_models.twin.fits import Study, fit_state
-from litho_models.twin.judging import judge
-from litho_models.twin.search import Cause, Found
-from tests.litho_models.twin_scans import bare_state, planted, study_of
+from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 
 def values_of(name: str) -> dict[str, float]:

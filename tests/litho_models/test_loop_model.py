@@ -9,13 +9,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import get_effect
+from litho_models.loop.fits import TwinProblem, fit_state, prepared_among, without_terms
+from litho_models.loop.model import Slot, Twin, Values
+from litho_models.loop.prepared import LARGE_PX, prepare_scans
+from litho_models.loop.results import clustered_covariance, confounded
 from litho_models.models import build_model
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.fits import TwinProblem, fit_state, prepared_among, without_terms
-from litho_models.twin.model import Slot, Twin, Values
-from litho_models.twin.prepared import LARGE_PX, prepare_scans
-from litho_models.twin.results import clustered_covariance, confounded
-from tests.litho_models.twin_scans import (
+from tests.litho_models.loop_scans import (
     BLUR_UM,
     PITCH_UM,
     bare_state,
