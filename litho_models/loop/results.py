@@ -261,10 +261,10 @@ def _candidate(closed: Closed, name: str, sets: Mapping[str, str]) -> Candidate:
             "too-few-scans",
             f"{len(closed.study.scans)} scans to choose and confirm on, at least {FEWEST_SCANS} needed",
         )
-    elif last.retained < _BASE_ABSORBS * last.beside_base:
-        verdict, reason = "absorbed", "numbers of the base do the same: its fit has taken it up"
-    elif last.retained < SMALLEST_RETAINED:
+    elif last.beside_base < SMALLEST_RETAINED:
         verdict, reason = "not-testable", "on these layouts it changes nothing that single scans do not"
+    elif last.retained < max(_BASE_ABSORBS * last.beside_base, SMALLEST_RETAINED):
+        verdict, reason = "absorbed", "numbers of the base do the same: its fit has taken it up"
     elif not last.allowed and p is not None and p <= FAMILY_P:
         verdict, reason = "contradicted", "its best strength has the wrong sign"
     else:
