@@ -1,6 +1,6 @@
 """What the measured prints lack: the loop's record, its tables and its picture on the page about it.
 
-litho-models close-loop runs/neural-lithography/store.zarr --base auto --nested prints --out runs/causes
+litho-models close-loop runs/neural-lithography/store.zarr --nested prints --out runs/causes
 python -m benchmarks.measured_causes runs/causes
 """
 

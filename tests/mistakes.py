@@ -77,7 +77,7 @@ MISTAKES: dict[str, dict[str, str]] = {
     "Names": {
         "a model misspelt": "litho-models train prints.zarr --model psyhics --out new",
         "a model of the zoo misspelt": "litho-models zoo show pbll",
-        "an effect misspelt": "litho-models close-loop prints.zarr --prior datum-ofset --out new",
+        "an effect misspelt": "litho-models close-loop prints.zarr --inject diffusion-blurr=0.1 --out new",
         "an effect without its amount": "litho-models close-loop prints.zarr --inject z-gain --out new",
         "a knob misspelt": "litho-data simulate --knob laser-drif=0.05 --out new",
         "a preset misspelt": "litho-data simulate --preset demmo --out new",
@@ -126,9 +126,7 @@ MISTAKES: dict[str, dict[str, str]] = {
         "a name in place of a list": 'litho_models.benchmark("prints.zarr", "new", models="affine")',
         "a training setting misspelt": 'litho_models.train("prints.zarr", "pbl", "new", '
         'settings={"stepz": 9})',
-        "a setting of the loop out of range": "litho_models.LoopConfig(folds=1)",
-        "a mapping in place of settings": 'litho_models.close_loop("prints.zarr", "new", '
-        'config={"folds": 3})',
+        "a setting of the loop out of range": 'litho_models.close_loop("prints.zarr", "new", folds=1)',
         "a scan that the store has not": 'litho_data.open_store("prints.zarr").scan("P0F9")',
         "a field of the optics misspelt": "litho_design.hologram_settings("
         'changes={"optics.wavelenght_um": 0.5})',
