@@ -85,9 +85,9 @@ def main() -> None:
     given = parser.parse_args()
     register()
     result = close_loop(given.store, given.out, base=given.base, folds=given.folds)
-    for one in (*result.effects, *result.candidates):
-        if one.name == "sinking-layers":
-            print(f"{one.name}: {one.verdict}")
+    verdicts: dict[str, str] = {one.name: one.verdict for one in result.effects}
+    verdicts |= {one.name: one.verdict for one in result.candidates}
+    print(f"sinking-layers: {verdicts['sinking-layers']}")
     for finding in result.single_scans:
         if finding.name == "cubic-bow":
             print(f"{finding.name}: {'seen' if finding.seen else 'not seen'}, {finding.evidence}")
