@@ -115,15 +115,9 @@ def test_every_candidate_has_a_verdict_once(closed) -> None:
     names = [one.name for one in (*result.effects, *result.candidates)]
     assert len(names) == len(set(names))
     assert all(one.reason for one in result.candidates)
-<<<<<<< HEAD:tests/litho_models/test_loop_run.py
     # Every scan has a gain of its own.
     shrunk = next(one for one in result.candidates if one.name == "vertical-shrinkage")
     assert shrunk.verdict == "not-testable"
-=======
-    # A gain that all scans share is nothing that their own gains do not do.
-    shrinkage = next(one for one in result.candidates if one.name == "vertical-shrinkage")
-    assert (shrinkage.verdict, "single scans" in shrinkage.reason) == ("not-testable", True)
->>>>>>> looptests2:tests/litho_models/test_twin_run.py
 
 
 def test_every_column_of_a_table_is_the_field_that_it_names(closed) -> None:
