@@ -79,7 +79,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Screened:
     """A trial with a way in which its strength goes, and what it gains on scans held out.
 
     Attributes:
@@ -193,9 +193,9 @@ class Screening:
         return found
 
     @cached_property
-    def candidates(self) -> list[Candidate]:
+    def candidates(self) -> list[Screened]:
         """The best trial of each effect in each grouping, the largest gain first."""
-        found: dict[tuple[str, str], Candidate] = {}
+        found: dict[tuple[str, str], Screened] = {}
         for trial, columns in zip(self.trials, self.columns, strict=True):
             for by in self.study.groups:
                 one = self._candidate(trial, columns, by)
@@ -204,7 +204,7 @@ class Screening:
                     found[one.name, by] = one
         return sorted(found.values(), key=lambda one: -one.gain_nm2)
 
-    def cosine(self, a: Candidate, b: Candidate) -> float:
+    def cosine(self, a: Screened, b: Screened) -> float:
         """Alignment of what two candidates change, pooled over scans."""
         groups = self.study.groups
         inner = np.zeros((2, 2))
@@ -215,7 +215,7 @@ class Screening:
             inner += vectors @ gram @ vectors.T
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
-    def permutation_p(self, one: Candidate) -> float:
+    def permutation_p(self, one: Screened) -> float:
         """Share of exchanges of the scans after which a strength by any grouping gains as much as this."""
         groupings = [np.array(labels) for by, labels in self.study.groups.items() if by != ALL]
         rng = np.random.default_rng(self.study.seed)
@@ -226,7 +226,7 @@ class Screening:
             beaten += any(own.mean() >= one.gain_nm2 * (1 - 1e-12) for own in gains)
         return (1 + beaten) / (1 + PERMUTATIONS)
 
-    def family_p(self, one: Candidate) -> float:
+    def family_p(self, one: Screened) -> float:
         """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
         return float(np.mean(self._largest >= one.gains_nm2.sum() * (1 - 1e-9)))
 
@@ -236,10 +236,10 @@ class Screening:
         gains = np.stack([one.gains_nm2 for one in self.candidates if one.by == ALL], axis=1)
         return (sign_flips(len(gains), self.study.seed) @ gains).max(axis=1)
 
-    def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Candidate:
+    def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Screened:
         gains, multiples = self._gains(trial, columns, self.study.groups[by])
         largest = max(max(trial.sizes(own).values()) for own in multiples.values())
-        return Candidate(
+        return Screened(
             trial=trial,
             by=by,
             gains_nm2=gains,

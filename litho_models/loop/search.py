@@ -16,7 +16,7 @@ from litho_data.foundation.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import FAMILY_P, Judgement, judge, told_apart
-from litho_models.loop.screening import SMALLEST_RETAINED, Candidate, Screening
+from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening
 from litho_models.scan_terms.groups import ALL
 
 MOST_EFFECTS = 8
@@ -56,8 +56,8 @@ class Found:
 
     state: State
     causes: list[Cause] = field(default_factory=list)
-    first: dict[str, Candidate] = field(default_factory=dict)
-    last: dict[str, Candidate] = field(default_factory=dict)
+    first: dict[str, Screened] = field(default_factory=dict)
+    last: dict[str, Screened] = field(default_factory=dict)
     family_p: dict[str, float] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
 
@@ -122,7 +122,7 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
     return False
 
 
-def _rivals(best: Candidate, standing: Sequence[Candidate], screening: Screening) -> list[Candidate]:
+def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
     """Those that promise about as much as the best, and change much the same."""
     return [
         one
@@ -134,7 +134,7 @@ def _rivals(best: Candidate, standing: Sequence[Candidate], screening: Screening
 
 
 def _alike(
-    one: Candidate, fitted: Mapping[str, State], before: State, screening: Screening, study: Study
+    one: Screened, fitted: Mapping[str, State], before: State, screening: Screening, study: Study
 ) -> tuple[str, ...]:
     """What these scans cannot tell from it: by fits where there are, by what is screened elsewhere."""
     own = fitted[one.name]
@@ -157,9 +157,9 @@ def _alike(
     return (*by_fit, *by_screening)
 
 
-def _standing(screening: Screening, found: Found) -> list[Candidate]:
+def _standing(screening: Screening, found: Found) -> list[Screened]:
     """The candidates that stand out, each with the grouping that its scans ask for, by gain."""
-    by_name: dict[str, list[Candidate]] = {}
+    by_name: dict[str, list[Screened]] = {}
     for one in screening.candidates:
         by_name.setdefault(one.name, []).append(one)
     mse = found.state.mse_nm2
@@ -180,8 +180,8 @@ def _standing(screening: Screening, found: Found) -> list[Candidate]:
 
 
 def _grouped(
-    own: Sequence[Candidate], common: Candidate, screening: Screening, mse_nm2: float
-) -> Candidate | None:
+    own: Sequence[Screened], common: Screened, screening: Screening, mse_nm2: float
+) -> Screened | None:
     """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
     groups = [one for one in own if one.by != ALL]
     least = max(common.gain_nm2, 0.0) + 0.01 * mse_nm2
@@ -195,7 +195,7 @@ def _grouped(
     return best if screening.permutation_p(best) <= FAMILY_P else None
 
 
-def _fitted(state: State, entering: Sequence[Candidate], study: Study) -> dict[str, State]:
+def _fitted(state: State, entering: Sequence[Screened], study: Study) -> dict[str, State]:
     jobs = [(one.name, state.twin.with_effect(one.name, one.by, one.start()), study) for one in entering]
     return {name: own for (name, *_), own in run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])}
 

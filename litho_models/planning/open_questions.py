@@ -25,7 +25,7 @@ from litho_models.loop.learner import Learner
 from litho_models.loop.model import Twin
 from litho_models.loop.record import CloseLoop
 from litho_models.loop.results import clustered_covariance, independent
-from litho_models.loop.screening import Candidate
+from litho_models.loop.screening import Screened
 from litho_models.loop.search import WORTH_FITTING, Cause, separating
 from litho_models.planning.noise import left_nm, noise_spectrum
 from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival
@@ -168,7 +168,7 @@ class _Asking:
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
 
-def _with(twin: Twin, one: Candidate) -> Twin:
+def _with(twin: Twin, one: Screened) -> Twin:
     return twin.with_effect(one.name, ALL, one.start()).ungrouped()
 
 

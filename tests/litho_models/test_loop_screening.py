@@ -8,7 +8,7 @@ import pytest
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Parameter, of_development
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.screening import PERMUTATIONS, Candidate, Screening, Trial, trials_of
+from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
 from litho_models.scan_terms.groups import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
@@ -16,7 +16,7 @@ LAW = "slope-x-power-1"
 EFFECTS = [get_effect(name) for name in (LAW, "height-power-2", "rising-slope-y", "place-map")]
 
 
-def screened(by: str, *strengths: float) -> tuple[Study, State, dict[tuple[str, str], Candidate], Screening]:
+def screened(by: str, *strengths: float) -> tuple[Study, State, dict[tuple[str, str], Screened], Screening]:
     labels = [""] if by == ALL else [str(k + 1) for k in range(len(strengths))]
     values = {label: {"strength": one} for label, one in zip(labels, strengths, strict=True)}
     study = study_of(planted([(LAW, by, values)]))
