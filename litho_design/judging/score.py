@@ -30,7 +30,7 @@ from litho_design.tasks.design import Design
 class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
-    ``uncertainty`` holds one standard deviation of a measured figure; None for models, and in older results.
+    ``uncertainty`` holds one standard deviation of a measured figure; None for models.
     With ``stitching`` the print is made of displaced write fields: figures are means over some draws of their
     places, uncertainties the standard deviation of one.
     """
