@@ -12,7 +12,7 @@ from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import ScoreResult
 from litho_design.reports.advice import WORDS, headline
-from litho_design.reports.parts import image_grid, meanings, score_table
+from litho_design.reports.parts import meanings, picture_grid, score_table
 
 
 def write_score_report(
@@ -39,13 +39,13 @@ def write_score_report(
     )
     page.verdict(_verdict(result))
     page.figure(
-        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
+        picture_grid({"": pictures}, side_um),
         "The wanted image, and behind each print the image at matched scale; of a lens the square root of "
         "the PSF.",
     )
     if photos:
         page.figure(
-            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
+            picture_grid({"": photos}, frame_um),
             "Photograph through the printed lens, each image at the scale of least error. The scores are of "
             "this one object.",
         )
