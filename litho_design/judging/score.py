@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -119,13 +119,15 @@ class Judgement:
 
     Attributes:
         scores: one per judge.
-        pictures: image or PSF (m, m) behind each print, share of the incident power per pixel, by title.
-        photos: object, photograph and reconstructions (n, n) of a lens, by title.
+        pictures: wanted image, image or PSF (m, m) behind each print, as shown, by title; ``side_um`` wide.
+        photos: object, photograph and reconstructions (n, n) of a lens, by title; ``frame_um`` wide.
     """
 
     scores: list[JudgedScore]
     pictures: dict[str, np.ndarray]
-    photos: dict[str, np.ndarray]
+    side_um: float
+    photos: dict[str, np.ndarray] = field(default_factory=dict)
+    frame_um: float = 0.0
 
 
 def judge_design(
@@ -185,7 +187,9 @@ def judge_design(
                 uncertainty=photo.uncertainty,
             )
         )
-    return Judgement(scores, pictures, photos)
+    wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
+    shown = wanted | {title: loaded.display(image) for title, image in pictures.items()}
+    return Judgement(scores, shown, loaded.window_um, photos, loaded.frame_um)
 
 
 def _stitched_score(
