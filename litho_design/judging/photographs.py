@@ -16,7 +16,7 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.noise import freed_of_noise, uncertainties
 from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
-from litho_design.images.similarity import likeness, matched_scale, similarity
+from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import reconstruct, sensor_psf
@@ -153,16 +153,9 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
     """Figures of a registered photograph (m, m) against its target and the target as far as it resolves."""
     share = torch.from_numpy(image).double()
-    lit, dark = share[target > 0.5], share[target <= 0.5]
-    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
-    efficiencies = {"eff_signal": float(lit.sum()), "eff_window": float(share.sum())} if has_power else {}
-    return PhotoScore(
-        **likeness(share, target, resolved),
-        speckle_contrast=float(lit.std(correction=0) / lit.mean()),
-        uniformity=1 - (high - low) / (high + low),
-        background_ratio=float(lit.mean() / dark.mean().clamp(min=1e-12)),
-        **efficiencies,
-    )
+    found = likeness(share, target, resolved) | light_figures(share, target)
+    known = {name: value for name, value in found.items() if has_power or not name.startswith("eff_")}
+    return PhotoScore.model_validate(known)
 
 
 @torch.no_grad()
@@ -206,8 +199,7 @@ def score_lens_photo(
     def figures(image: np.ndarray) -> LensPhotoScore:
         values: dict[str, float] = {}
         for name, estimate in estimates(image).items():
-            near = similarity(estimate, wanted)
-            values |= {f"mae_{name}": near.mae, f"psnr_{name}_db": near.psnr_db, f"ssim_{name}": near.ssim}
+            values |= similarity(estimate, wanted, name)
         return LensPhotoScore.model_validate(values)
 
     image = photo.image()
