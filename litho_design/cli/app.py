@@ -131,7 +131,7 @@ def score(
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
-    from litho_design.judging.photographs import PhotoSource
+    from litho_design.images.photograph import PhotoSource
     from litho_design.optimisation.stitching import Stitching
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design

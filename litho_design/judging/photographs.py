@@ -15,7 +15,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.noise import freed_of_noise, uncertainties
-from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
+from litho_design.images.photograph import CameraRecord, Photograph, PhotoSource, photographed_image
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
@@ -28,29 +28,6 @@ from litho_design.optics.imaging import Blur
 _LARGEST_SD_DB = 0.5
 # Of what a blur of the camera changes, this share stays open.
 _BLUR_SD = 0.3
-
-
-@dataclass(frozen=True)
-class PhotoSource:
-    """A photograph, its pixel in the image plane, and its dark level if known.
-
-    Attributes:
-        imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
-        orientation: the operation that brings it upright, where the camera turned or mirrored it.
-        power_counts: summed counts, without dark level, of all light that falls on the element, at the same
-            exposure; without it a photograph knows no efficiency.
-        pitch_sd: relative standard uncertainty of the pitch, where the magnification is not sure.
-        flat: photograph of an even light by the same camera; with it a vignetting is none.
-    """
-
-    path: Path
-    pitch_um: float
-    dark_level: float | None = None
-    imaged: str | None = None
-    orientation: str = "identity"
-    power_counts: float | None = None
-    pitch_sd: float = 0.0
-    flat: Path | None = None
 
 
 class PhotoScore(Record):
@@ -143,11 +120,7 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
     # The finest fringes are those of rays from two sides of the element.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
-    return photographed_image(
-        wanted, pitch_um, source.path, source.pitch_um,
-        finest_per_um=finest_per_um, dark_level=source.dark_level, orientation=source.orientation,
-        pitch_sd=source.pitch_sd, flat_file=source.flat,
-    )  # fmt: skip
+    return photographed_image(wanted, pitch_um, source, finest_per_um)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:

@@ -15,10 +15,10 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.noise import DRAWS, uncertainties
-from litho_design.images.photograph import CameraRecord
+from litho_design.images.photograph import CameraRecord, PhotoSource
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
-from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
+from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
 from litho_design.optimisation.stitching import Stitching

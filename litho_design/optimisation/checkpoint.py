@@ -52,8 +52,8 @@ def save_checkpoint(
 ) -> None:
     """Write the state of a search and of its parts; ``fingerprint`` says which task they belong to."""
     found = vars(state) | {"earlier_seconds": seconds}
-    content = {name: part.state_dict() for name, part in stateful.items()}
-    content |= {"fingerprint": fingerprint, "found": found}
+    states = {name: part.state_dict() for name, part in stateful.items()}
+    content = states | {"fingerprint": fingerprint, "found": found}
     with atomic_file(path) as temporary:
         torch.save(content, temporary)
 

@@ -56,7 +56,8 @@ def score(
             does not match it, or an ``out`` that holds another kind of result.
     """
     loaded = design if isinstance(design, LoadedDesign) else None
-    record = loaded.record if isinstance(design, LoadedDesign) else Design.read(design)
+    folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
+    record = Design.read(folder) if loaded is None else loaded.record
     in_parts = band_px is not None or record.in_rings
     if in_parts and any(one is not None for one in (loaded, scan, camera, element)):
         given = "a scan, a photograph, another element or a design in memory"
@@ -64,10 +65,9 @@ def score(
     if record.in_rings and (stitch is not None or band_px is not None):
         raise InputError("score of a lens in rings", got="write fields or bands", wanted="neither")
     if loaded is None and not in_parts:
-        loaded = LoadedDesign(design, device=device, element=element)
+        loaded = LoadedDesign(folder, device=device, element=element)
     if loaded is not None:
         record, device = loaded.record, loaded.device
-    folder = Path(design) if loaded is None else loaded.folder
     printers = list(load_printers(judges, record.layout, device=device, extrapolate=extrapolate).values())
     if not printers and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
