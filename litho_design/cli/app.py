@@ -131,7 +131,7 @@ def score(
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
-    from litho_design.judging.photographs import PhotoSource
+    from litho_design.images.photograph import PhotoSource
     from litho_design.optimisation.stitching import Stitching
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
@@ -139,24 +139,6 @@ def score(
     if not judge and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
     stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
-    if stream:
-        if (
-            scan is not None
-            or camera is not None
-            or element is not None
-            or task_file is not None
-            or device != "cpu"
-        ):
-            raise InputError("--stream", got="another option than --judge", wanted="models as judges")
-        from litho_design.optimisation.budget import peak_memory_gib
-        from litho_design.workflows.large import score_from_disk
-
-        result = score_from_disk(
-            design, out, judges=judge or (), band_px=band_px, stitch=stitch, extrapolate=extrapolate
-        )
-        _print_scores(result, out)
-        print(f"peak memory {peak_memory_gib():.2f} GiB")
-        return
     if camera is not None and camera_pitch_um is None:
         raise InputError(
             "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
@@ -187,6 +169,7 @@ def score(
         camera=photo,
         element=element,
         stitch=stitch,
+        band_px=band_px if stream else None,
         device=device,
         extrapolate=extrapolate,
     )

@@ -153,16 +153,9 @@ def hoe(
     if front is None and (dask or workers > 1):
         raise InputError("--workers and --dask", got="one design", wanted="several: --front")
     fit: Any = {"device": device, "extrapolate": extrapolate}
-    if large:
-        if front is not None or ensemble:
-            raise InputError("--large", got="--front or --ensemble", wanted="one design through one model")
-        from litho_design.large.bands import Ranks
-        from litho_design.workflows.large import design_large_hologram
-
-        design = design_large_hologram(target, model, out, settings=settings, band_px=band_px, **fit)
-        if Ranks.joined().rank == 0:
-            _print_design(design, out)
-    elif front is not None:
+    if front is not None:
+        if large:
+            raise InputError("--large", got="--front", wanted="one design")
         from litho_design.workflows.front import efficiency_front
 
         result = efficiency_front(
@@ -171,12 +164,15 @@ def hoe(
         )  # fmt: skip
         _print_front(result, out)
     else:
+        from litho_design.large.bands import Ranks
         from litho_design.workflows.design import design_hologram
 
         design = design_hologram(
-            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust, **fit
-        )
-        _print_design(design, out)
+            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
+            band_px=band_px if large else None, **fit,
+        )  # fmt: skip
+        if not large or Ranks.joined().rank == 0:
+            _print_design(design, out)
 
 
 @takes_settings(ReliefSettings())
@@ -245,21 +241,12 @@ def lens(
     Example: litho-design lens --model zoo:pbl --distance-um 200 --out lens
     """
     settings = _settings(given, _lens, "lens", spread_of, roughness_of)
-    if large:
-        if objects or held_out_objects or ensemble:
-            raise InputError("--large", got="objects or --ensemble", wanted="one lens through one model")
-        from litho_design.workflows.large import design_large_lens
-
-        design = design_large_lens(
-            model, out, settings=settings, tile_px=band_px, device=device, extrapolate=extrapolate
-        )
-        _print_design(design, out)
-        return
     from litho_design.workflows.design import design_lens
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
+        ensemble=ensemble or (), judges=judge, robust=robust, tile_px=band_px if large else None,
+        device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -329,7 +316,7 @@ def estimate(
 
     Example: litho-design estimate --model zoo:physics --size-px 10000
     """
-    from litho_design.workflows.large import estimate_large
+    from litho_design.large.cost import estimate_large
 
     made = _settings(given, _hologram, "estimate")
     sizes = numbers("--measure-px", measure_px, int)

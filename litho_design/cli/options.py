@@ -179,11 +179,6 @@ def takes_settings(
     return decorate
 
 
-def option_paths(preset: BaseModel) -> dict[str, str]:
-    """The path of the setting behind every option."""
-    return {name: leaf.path for leaf in leaves(preset) for name in leaf.options}
-
-
 def as_toml(settings: BaseModel) -> str:
     """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
     lines: list[str] = []

@@ -10,17 +10,23 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
 from litho_design.exports.gwl import Gwl
 from litho_design.exports.marks import Marks
+from litho_design.optics.stroke import Stroke
 from litho_design.printers.layout import LayoutSettings, Printability
+from litho_design.printers.printer import PrinterRecord
 from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.design import Design
 
 Format = Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
 
 
+# What a sidecar takes over from the record of its design.
+_OF_DESIGN = ("printer", "stroke", "printability", "out_of_distribution", "predicted", "settings")
+
+
 class Sidecar(Result):
     """<file>.json beside an exported file; bare levels and heights lack what a design knows."""
 
-    SCHEMA: ClassVar[str] = "litho-design/export/1"
+    SCHEMA: ClassVar[str] = "litho-design/export/2"
     FILE_NAME: ClassVar[str] = "export.json"
 
     file: str
@@ -53,20 +59,11 @@ class Sidecar(Result):
     marks: Marks | None = None
     polarity: Literal["higher level is higher resist"] = "higher level is higher resist"
     design_sha256: str | None = None
-    model_name: str | None = None
-    model_sha256: str | None = None
-    extrapolated: bool | None = None
-    predicted_height_um: list[float] | None = None
-    predicted_gain: float | None = None
-    predicted_offset_um: float | None = None
-    wavelength_um: float | None = None
-    index_step: float | None = None
-    distance_um: float | None = None
-    minimum_feature_um: float | None = None
+    printer: PrinterRecord | None = None
+    stroke: Stroke | None = None
     printability: Printability | None = None
     out_of_distribution: OutOfDistribution | None = None
     predicted: dict[str, float] | None = None
-    seeds: list[int] | None = None
     settings: dict[str, Any] | None = None
 
 
@@ -86,25 +83,8 @@ def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, An
 
 def of_design(folder: Path, design: Design) -> dict[str, Any]:
     """Fields of the sidecar that only a design knows."""
-    optics, stroke, found = design.optics, design.stroke, design.printability
-    return {
-        "design_sha256": file_sha256(folder / Design.FILE_NAME),
-        "model_name": design.printer.name,
-        "model_sha256": design.printer.sha256,
-        "extrapolated": design.printer.extrapolated,
-        "predicted_height_um": stroke.printed_height_um,
-        "predicted_gain": stroke.print_gain,
-        "predicted_offset_um": stroke.printed_height_um[0],
-        "wavelength_um": optics.wavelength_um,
-        "index_step": optics.index_step,
-        "distance_um": optics.distance_um,
-        "minimum_feature_um": found.smallest_ring_um or found.smallest_feature_um,
-        "printability": found,
-        "out_of_distribution": design.out_of_distribution,
-        "predicted": design.predicted,
-        "seeds": [int(design.settings["search"]["seed"])],
-        "settings": design.settings,
-    }
+    shared = {name: getattr(design, name) for name in _OF_DESIGN}
+    return {"design_sha256": file_sha256(folder / Design.FILE_NAME), **shared}
 
 
 def sidecar_path(file: Path) -> Path:

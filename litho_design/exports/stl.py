@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from litho_data.foundation.errors import InputError
 from litho_design.exports.step_solid import step_solid
@@ -66,18 +67,9 @@ def read_stl_levels(
     corners = read_stl_triangles(path).astype(np.float64)
     flat = corners[(np.ptp(corners[..., 2], axis=1) == 0) & (corners[:, 0, 2] > 0)]
     level = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um).astype(np.int64)
-    start = flat[..., :2].reshape(-1, 2) / cell_um
-    end = np.roll(flat, -1, axis=1)[..., :2].reshape(-1, 2) / cell_um
-    # Each edge is crossed by the middles of rows: level begins to its right if it runs down, and ends if up.
-    down = end[:, 1] < start[:, 1]
-    low, high = np.where(down[:, None], end, start), np.where(down[:, None], start, end)
-    first, last = (np.ceil(one[:, 1] - 0.5).astype(int) for one in (low, high))
-    edge = np.repeat(np.arange(len(low)), last - first)
-    row = np.arange(edge.size) - np.repeat(np.cumsum(last - first) - last, last - first)
-    share = (row + 0.5 - low[edge, 1]) / (high - low)[edge, 1]
-    x = low[edge, 0] + share * (high - low)[edge, 0]
-    begins = np.zeros((shape[0], shape[1] + 1), np.int64)
-    np.add.at(
-        begins, (row, np.ceil(x - 0.5).astype(int)), np.where(down, 1, -1)[edge] * level.repeat(3)[edge]
-    )
-    return begins.cumsum(axis=1)[::-1, :-1].astype(np.uint8)
+    faces = shapely.STRtree(shapely.polygons(flat[..., :2] / cell_um))
+    found = np.zeros(shape, np.uint8)
+    for row, middle in enumerate(np.arange(shape[0]) + 0.5):
+        column, face = faces.query(shapely.points(np.arange(shape[1]) + 0.5, middle), predicate="intersects")
+        found[row, column] = level[face]
+    return found[::-1]

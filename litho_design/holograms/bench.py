@@ -13,7 +13,14 @@ from torch import Tensor
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import CameraView
-from litho_design.images.similarity import SSIM_WINDOW_PX, likeness, matched_scale, paper_rmse, ssim
+from litho_design.images.similarity import (
+    SSIM_WINDOW_PX,
+    light_figures,
+    likeness,
+    matched_scale,
+    paper_rmse,
+    ssim,
+)
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
@@ -80,22 +87,15 @@ def hologram_score(
     area = math.prod(grid.pitch_um)
     share = _added(waves) * area
     wanted = target.double()
-    signal = wanted > 0.5
     scaled = matched_scale(share, wanted) * share
-    lit, dark = share[signal], share[~signal]
-    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
     return HologramScore(
-        eff_signal=float(lit.sum()),
+        **light_figures(share, wanted),
         eff_paper=float(share[wanted > 0].sum()),
-        eff_window=float(share.sum()),
         zero_order_share=zero_order_share(element),
         **likeness(share, wanted, at_resolution(wanted, grid, optics)),
         rmse_paper=float(paper_rmse(share, wanted)),
         clipped_share=float((scaled > 1).double().mean()),
         ssim_camera=camera_ssim(waves, wanted, grid, optics, camera),
-        speckle_contrast=float(lit.std(correction=0) / lit.mean()),
-        uniformity=1 - (high - low) / (high + low),
-        background_ratio=float(lit.mean() / dark.mean()),
     )
 
 

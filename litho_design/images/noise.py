@@ -20,10 +20,8 @@ _NOISE_BAND = 0.35
 
 def white_noise(values: np.ndarray) -> float:
     """Standard deviation of the white noise in a map (ny, nx), from its highest frequencies."""
-    ny, nx = values.shape
-    window = np.hanning(ny)[:, None] * np.hanning(nx)
+    window, high = _window_and_band(values.shape)
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()
-    high = (np.abs(np.fft.fftfreq(ny)) > _NOISE_BAND)[:, None] & (np.abs(np.fft.fftfreq(nx)) > _NOISE_BAND)
     return float(np.sqrt(power[high].mean()))
 
 
@@ -34,15 +32,19 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     """
     from scipy.ndimage import gaussian_filter
 
-    ny, nx = counts.shape
-    window = np.hanning(ny)[:, None] * np.hanning(nx)
-    high = (np.abs(np.fft.fftfreq(ny)) > _NOISE_BAND)[:, None] & (np.abs(np.fft.fftfreq(nx)) > _NOISE_BAND)
+    window, high = _window_and_band(counts.shape)
     noise = np.fft.ifft2(np.fft.fft2(counts * window) * high).real / np.sqrt(high.mean())
     light = gaussian_filter(counts.astype(float).clip(0), 2.0)
     columns = np.square(np.stack([window, window * light], axis=-1)).reshape(-1, 2)
     scale = columns.max(0)
     (dark, share), _ = nnls(columns / scale, np.square(noise).ravel())
     return float(np.sqrt(dark / scale[0])), float(np.sqrt(share / scale[1]))
+
+
+def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Hann window of a map, and which of its frequencies hold noise only."""
+    along = [np.abs(np.fft.fftfreq(count)) > _NOISE_BAND for count in shape]
+    return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:

@@ -88,6 +88,29 @@ class CameraRecord(Record):
 
 
 @dataclass(frozen=True)
+class PhotoSource:
+    """A photograph, its pixel in the image plane, and its dark level if known.
+
+    Attributes:
+        imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
+        orientation: the operation that brings it upright, where the camera turned or mirrored it.
+        power_counts: summed counts, without dark level, of all light that falls on the element, at the same
+            exposure; without it a photograph knows no efficiency.
+        pitch_sd: relative standard uncertainty of the pitch, where the magnification is not sure.
+        flat: photograph of an even light by the same camera; with it a vignetting is none.
+    """
+
+    path: Path
+    pitch_um: float
+    dark_level: float | None = None
+    imaged: str | None = None
+    orientation: str = "identity"
+    power_counts: float | None = None
+    pitch_sd: float = 0.0
+    flat: Path | None = None
+
+
+@dataclass(frozen=True)
 class Photograph:
     """A photograph and where the image lies on it.
 
@@ -155,16 +178,7 @@ class Photograph:
 
 
 def photographed_image(
-    wanted: np.ndarray,
-    wanted_pitch_um: float,
-    photo_file: str | Path,
-    pitch_um: float,
-    *,
-    finest_per_um: float,
-    dark_level: float | None = None,
-    orientation: str = "identity",
-    pitch_sd: float = 0.0,
-    flat_file: str | Path | None = None,
+    wanted: np.ndarray, wanted_pitch_um: float, source: PhotoSource, finest_per_um: float
 ) -> Photograph:
     """A photograph, registered on the image that the design expects.
 
@@ -176,17 +190,16 @@ def photographed_image(
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
-        photo_file: grey image of any bit depth, counts proportional to the light.
-        pitch_um: camera pixel in the plane of the image, µm; ``pitch_sd`` its relative standard uncertainty.
+        source: grey image of any bit depth, counts proportional to the light. Without its dark level, that is
+            what makes the darkest pixels as bright as expected.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; what is finer is left out.
-        dark_level: counts without light; without it, what makes the darkest pixels as bright as expected.
-        orientation: what brings the photograph upright, such as ``flip-x`` or ``rotate-180``.
-        flat_file: photograph of an even light by the same camera, whose brightness is divided out.
 
     Raises:
         InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
             is overexposed, not linear, unlike the expected image, or mirrored or turned.
     """
+    photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
+    dark_level, orientation = source.dark_level, source.orientation
     if not pitch_um > 0 or not pitch_sd >= 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm ± {pitch_sd}", wanted="a positive number")
     require_known("camera orientation", orientation, ORIENTATIONS)
@@ -202,8 +215,8 @@ def photographed_image(
             hint="a shorter exposure" if saturated > cut_off else "a black level above the noise",
         )
     cleaned, replaced = _replace_outliers(photo)
-    if flat_file is not None:
-        cleaned = _flattened(cleaned, flat_file, dark_level)
+    if source.flat is not None:
+        cleaned = _flattened(cleaned, source.flat, dark_level)
     wanted, scale = wanted.astype(np.float32) / wanted.max(), pitch_um / wanted_pitch_um
     ambiguous = _check_orientation(cleaned, wanted, scale, pitch_sd, orientation, photo_file)
     upright = np.ascontiguousarray(orient(cleaned, orientation))
@@ -245,7 +258,7 @@ def photographed_image(
         dark_level_sd=dark_sd,
         position_sd_um=fit.position_sd_px * wanted_pitch_um,
         scale_sd=fit.scale_sd,
-        vignetting_sd=_VIGNETTING_SD if flat_file is None else 0.0,
+        vignetting_sd=_VIGNETTING_SD if source.flat is None else 0.0,
         blur_um=fit.blur_px * wanted_pitch_um,
         gamma=fit.gamma,
         coverage=coverage,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -64,21 +62,28 @@ def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float
     return figures
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """How far an estimate is from the object: mean absolute error, PSNR in dB, SSIM."""
+def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
+    """``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME`` of an estimate (n, n) of an object (n, n) in [0, 1].
 
-    mae: float
-    psnr_db: float
-    ssim: float
-
-
-def similarity(estimate: Tensor, wanted: Tensor) -> Similarity:
-    """Errors of an estimate (n, n) of an object (n, n) in [0, 1]; PSNR and SSIM clip it to that range."""
+    PSNR and SSIM clip the estimate to that range.
+    """
     clipped = estimate.clamp(0, 1)
     error = (clipped - wanted).square().mean().clamp(min=1e-12)
-    return Similarity(
-        mae=float((estimate - wanted).abs().mean()),
-        psnr_db=float(-10 * torch.log10(error)),
-        ssim=ssim(clipped, wanted),
-    )
+    return {
+        f"mae_{name}": float((estimate - wanted).abs().mean()),
+        f"psnr_{name}_db": float(-10 * torch.log10(error)),
+        f"ssim_{name}": ssim(clipped, wanted),
+    }
+
+
+def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
+    """Where the light of an image (m, m) is, and how even: the signal is {T > 0.5}."""
+    lit, dark = share[target > 0.5], share[target <= 0.5]
+    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
+    return {
+        "eff_signal": float(lit.sum()),
+        "eff_window": float(share.sum()),
+        "speckle_contrast": float(lit.std(correction=0) / lit.mean()),
+        "uniformity": 1 - (high - low) / (high + low),
+        "background_ratio": float(lit.mean() / dark.mean().clamp(min=1e-12)),
+    }

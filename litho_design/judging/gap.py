@@ -93,9 +93,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
     """Mean, interval and gap of every figure for every arm and judge."""
     summary = []
     for (arm, judge), group in _grouped(entries).items():
-        # A design made by older code lacks the figures that came later.
-        known = [name for name in group[0].judged if all(name in entry.designed for entry in group)]
-        for figure in known:
+        for figure in group[0].judged:
             judged = np.array([entry.judged[figure] for entry in group])
             designed = np.array([entry.designed[figure] for entry in group])
             summary.append(

@@ -15,8 +15,8 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.noise import freed_of_noise, uncertainties
-from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
-from litho_design.images.similarity import likeness, matched_scale, similarity
+from litho_design.images.photograph import CameraRecord, Photograph, PhotoSource, photographed_image
+from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import reconstruct, sensor_psf
@@ -28,29 +28,6 @@ from litho_design.optics.imaging import Blur
 _LARGEST_SD_DB = 0.5
 # Of what a blur of the camera changes, this share stays open.
 _BLUR_SD = 0.3
-
-
-@dataclass(frozen=True)
-class PhotoSource:
-    """A photograph, its pixel in the image plane, and its dark level if known.
-
-    Attributes:
-        imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
-        orientation: the operation that brings it upright, where the camera turned or mirrored it.
-        power_counts: summed counts, without dark level, of all light that falls on the element, at the same
-            exposure; without it a photograph knows no efficiency.
-        pitch_sd: relative standard uncertainty of the pitch, where the magnification is not sure.
-        flat: photograph of an even light by the same camera; with it a vignetting is none.
-    """
-
-    path: Path
-    pitch_um: float
-    dark_level: float | None = None
-    imaged: str | None = None
-    orientation: str = "identity"
-    power_counts: float | None = None
-    pitch_sd: float = 0.0
-    flat: Path | None = None
 
 
 class PhotoScore(Record):
@@ -143,26 +120,15 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
     # The finest fringes are those of rays from two sides of the element.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
-    return photographed_image(
-        wanted, pitch_um, source.path, source.pitch_um,
-        finest_per_um=finest_per_um, dark_level=source.dark_level, orientation=source.orientation,
-        pitch_sd=source.pitch_sd, flat_file=source.flat,
-    )  # fmt: skip
+    return photographed_image(wanted, pitch_um, source, finest_per_um)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
     """Figures of a registered photograph (m, m) against its target and the target as far as it resolves."""
     share = torch.from_numpy(image).double()
-    lit, dark = share[target > 0.5], share[target <= 0.5]
-    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
-    efficiencies = {"eff_signal": float(lit.sum()), "eff_window": float(share.sum())} if has_power else {}
-    return PhotoScore(
-        **likeness(share, target, resolved),
-        speckle_contrast=float(lit.std(correction=0) / lit.mean()),
-        uniformity=1 - (high - low) / (high + low),
-        background_ratio=float(lit.mean() / dark.mean().clamp(min=1e-12)),
-        **efficiencies,
-    )
+    found = likeness(share, target, resolved) | light_figures(share, target)
+    known = {name: value for name, value in found.items() if has_power or not name.startswith("eff_")}
+    return PhotoScore.model_validate(known)
 
 
 @torch.no_grad()
@@ -206,8 +172,7 @@ def score_lens_photo(
     def figures(image: np.ndarray) -> LensPhotoScore:
         values: dict[str, float] = {}
         for name, estimate in estimates(image).items():
-            near = similarity(estimate, wanted)
-            values |= {f"mae_{name}": near.mae, f"psnr_{name}_db": near.psnr_db, f"ssim_{name}": near.ssim}
+            values |= similarity(estimate, wanted, name)
         return LensPhotoScore.model_validate(values)
 
     image = photo.image()

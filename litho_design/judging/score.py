@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -15,10 +15,10 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.noise import DRAWS, uncertainties
-from litho_design.images.photograph import CameraRecord
+from litho_design.images.photograph import CameraRecord, PhotoSource
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
-from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
+from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
 from litho_design.optimisation.stitching import Stitching
@@ -30,7 +30,7 @@ from litho_design.tasks.design import Design
 class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
-    ``uncertainty`` holds one standard deviation of a measured figure; None for models, and in older results.
+    ``uncertainty`` holds one standard deviation of a measured figure; None for models.
     With ``stitching`` the print is made of displaced write fields: figures are means over some draws of their
     places, uncertainties the standard deviation of one.
     """
@@ -119,13 +119,15 @@ class Judgement:
 
     Attributes:
         scores: one per judge.
-        pictures: image or PSF (m, m) behind each print, share of the incident power per pixel, by title.
-        photos: object, photograph and reconstructions (n, n) of a lens, by title.
+        pictures: wanted image, image or PSF (m, m) behind each print, as shown, by title; ``side_um`` wide.
+        photos: object, photograph and reconstructions (n, n) of a lens, by title; ``frame_um`` wide.
     """
 
     scores: list[JudgedScore]
     pictures: dict[str, np.ndarray]
-    photos: dict[str, np.ndarray]
+    side_um: float
+    photos: dict[str, np.ndarray] = field(default_factory=dict)
+    frame_um: float = 0.0
 
 
 def judge_design(
@@ -185,7 +187,9 @@ def judge_design(
                 uncertainty=photo.uncertainty,
             )
         )
-    return Judgement(scores, pictures, photos)
+    wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
+    shown = wanted | {title: loaded.display(image) for title, image in pictures.items()}
+    return Judgement(scores, shown, loaded.window_um, photos, loaded.frame_um)
 
 
 def _stitched_score(

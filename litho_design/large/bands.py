@@ -17,6 +17,11 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 
+# Rows of a band at most. Memory for a print grows with its square, and bands are the most processes that
+# can share an element; below some four times the model's reach most of the time goes into what is printed
+# twice.
+BAND_PX = 512
+
 
 @dataclass(frozen=True)
 class Ranks:

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.targets import load_target
-from litho_design.large.bands import Bands
+from litho_design.large.bands import BAND_PX, Bands, Ranks
 from litho_design.large.hologram import BandedHologram
 from litho_design.optics.sampling import fast_length
 from litho_design.optimisation.budget import measure_budget, peak_memory_gib
 from litho_design.printers.printer import Printer
+from litho_design.printers.source import Device, load_printer
 
 _GIB = 2**30
 # In use at the peak of an iteration; 32 are the spectrum and half the transfer function, of twice the side.
@@ -137,6 +140,56 @@ def fit_cost(measured: Sequence[MeasuredSize]) -> CostModel:
         evaluation_s_per_px=max(last.evaluation_s - last.transforms_s / 2, 0.0) / pixels,
         memory_gib=last.peak_memory_gib - _IN_USE_BYTES_PER_PX * pixels / _GIB,
     )
+
+
+def estimate_large(
+    model: str | Path | Printer,
+    settings: HologramSettings,
+    measure_px: Sequence[int],
+    ranks: int = 1,
+    band_px: int = BAND_PX,
+    *,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+) -> list[str]:
+    """What ``design_hologram`` in bands would take with these settings, from small elements measured here.
+
+    Args:
+        measure_px: sides of elements, to the largest of which the model of the cost is fitted.
+        ranks: processes that would share the element, each on a machine like this one.
+
+    Returns:
+        One sentence for each size that was measured, and those of the estimate.
+
+    Raises:
+        InputError: no size, sizes that cells do not fill, or what ``design_hologram`` refuses.
+    """
+    sizes = sorted(set(measure_px))
+    if not sizes:
+        raise InputError("sizes to measure", got="none", wanted="at least one")
+    layout, search = settings.layout, settings.search
+    Bands(layout.size_px, band_px, Ranks(0, ranks), layout.cell_px)
+    printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
+    measured = [measure_size(settings, printer, size, band_px) for size in sizes]
+    cost, size = fit_cost(measured), layout.size_px
+    lines = [
+        f"measured: {one.size_px} px, {one.iteration_s:.2f} s per iteration, {one.transforms_s:.2f} s of it "
+        f"for the transforms; {one.peak_memory_gib:.2f} GiB"
+        for one in measured
+    ]
+    hours = cost.search_s(size, settings, ranks) / 3600
+    lines.append(
+        f"estimate for {size} px ({layout.size_um / 1000:.3g} mm), {search.iterations} iterations: "
+        f"{cost.iteration_s(size, ranks):.3g} s per iteration, {hours:.3g} h in all; memory "
+        f"{cost.memory_of_rank_gib(size, ranks):.3g} GiB{' in each process' if ranks > 1 else ''}; folder of "
+        f"{disk_gib(size):.3g} GiB"
+    )
+    if ranks > 1:
+        lines.append(
+            f"{ranks} processes on as many machines like this one; each sends "
+            f"{sent_gib(size, ranks):.3g} GiB per iteration, whose time is not in the estimate"
+        )
+    return lines
 
 
 def _operations(size_px: int) -> float:

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from litho_design.judging.score import JudgedScore
-from litho_design.large.bands import Bands
+from litho_design.judging.score import JudgedScore, Judgement
+from litho_design.large.bands import BAND_PX, Bands
 from litho_design.large.hologram import ONLY, only
 from litho_design.large.printing import check_printer, tiles
 from litho_design.lenses.bench import RadialLensBench
@@ -145,14 +145,10 @@ class RingLens(DirectLensTask):
 
 
 @torch.no_grad()
-def judge_rings(
-    folder: Path, record: Design, judges: Sequence[Printer], tile_px: int
-) -> tuple[list[JudgedScore], dict[str, np.ndarray], float]:
+def judge_rings(folder: Path, record: Design, judges: Sequence[Printer]) -> Judgement:
     """Print the rings of a design by models, and score them along the radius.
 
-    Returns:
-        A score for each judge, with the differences of heights over the plane; PSFs (m, m) by title, share of
-        the incident power per pixel; their side, µm.
+    Heights differ over the plane; the pictures are square roots of PSFs over their peaks.
 
     Raises:
         InputError: rings that changed after the design, or a judge without a finite reach.
@@ -162,16 +158,14 @@ def judge_rings(
     scores: list[JudgedScore] = []
     pictures: dict[str, np.ndarray] = {}
     for printer in judges:
-        lens, judge = RingLens(settings, printer, tile_px, bench), printer.record()
+        lens, judge = RingLens(settings, printer, BAND_PX, bench), printer.record()
         bench = lens.bench
         height = lens.printed_um(rings.to(printer.device))
-        pictures |= {
-            title: bench(print_um.to(printer.device)).cpu().numpy()
-            for title, print_um in (("in design", expected), (f"printed by {judge.name}", height))
-        }
+        for title, print_um in (("in design", expected), (f"printed by {judge.name}", height)):
+            pictures[title] = lens.display(bench(print_um.to(printer.device)).cpu().numpy())
         off, area = (height.cpu() - expected).double(), bench.propagator.ring_area_um2
         share = area / area.sum()
         off_um = float((off * share).sum()), float((off.square() * share).sum().sqrt())
         scores.append(JudgedScore.of_print(record, judge, off_um, lens.score(height).model_dump()))
     assert bench is not None
-    return scores, pictures, bench.window.size_um[0]
+    return Judgement(scores, pictures, bench.window.size_um[0])

@@ -155,7 +155,7 @@ class BandedPropagator:
         rows, columns = spectrum_axes(*given)
         half = self.length // 2 + 1
         if len(rows.frequency) > self.length:
-            self._transfer[:] = ASMPropagator(*given).transfer[0, 0, :half, first:last].T
+            self._transfer[:] = ASMPropagator(*given).transfer[:half, first:last].T
             return
         for block in self._blocks:
             own = columns.part(slice(first + block.start, first + block.stop))

@@ -7,6 +7,8 @@ resolved target, uniformity) are left out.
 from __future__ import annotations
 
 import math
+import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,14 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_design.images.similarity import SSIM_WINDOW_PX, ssim_map
+from litho_design.judging.score import JudgedScore, Judgement
 from litho_design.large.bands import Allocate, Bands
 from litho_design.large.printing import check_printer, print_band
 from litho_design.large.propagator import BandedPropagator
 from litho_design.optics import Optics, element_field, intensity_share
+from litho_design.optics.source import require_one_wave
 from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
+from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design, read_array
 
 _PREVIEW_PX = 1024
 
@@ -37,6 +43,54 @@ def on_disk(folder: Path) -> Allocate:
         return torch.from_numpy(array)
 
     return allocate
+
+
+def judge_from_disk(
+    folder: Path,
+    record: Design,
+    judges: Sequence[Printer],
+    band_px: int,
+    stitch: Stitching | None,
+    out: Path,
+) -> Judgement:
+    """Score the layout of a hologram by models, with everything large on disk.
+
+    Needs room in ``out`` for 54 bytes per pixel, for the time that it takes.
+
+    Args:
+        stitch: write fields that the prints are made of; one draw of their places, as there are many.
+
+    Raises:
+        InputError: a design that is no hologram of a thin element, or a judge without a finite reach.
+    """
+    layout, optics = record.layout, record.optics
+    if record.task != "hoe" or optics.element != "thin":
+        got = f"{record.task}, {optics.element}"
+        raise InputError("design to score from disk", got=got, wanted="a hologram, thin")
+    require_one_wave(optics, "a design to score from disk")
+    level, expected, seen, target = (
+        read_array(folder, name, on_disk=True) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
+    )
+    bands = Bands(layout.size_px, band_px)
+    scores, pictures = [], {"in design": preview(seen, bands)}
+    for printer in judges:
+        judge = printer.record()
+        with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
+            room = Path(name)
+            height, image = (
+                np.memmap(room / file, np.float32, "w+", shape=level.shape) for file in ("height", "image")
+            )
+            print_from_disk(level, printer, bands, height)
+            printed: np.ndarray = height
+            if stitch is not None:
+                printed = in_fields_from_disk(height, layout.pitch_um, stitch, bands, on_disk(room)).numpy()
+            zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
+            off_um = _difference(printed, expected, bands)
+            figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
+            pictures[f"printed by {judge.name}"] = preview(image, bands)
+        scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
+    brightest = {title: picture / picture.max() for title, picture in pictures.items()}
+    return Judgement(scores, brightest, layout.size_um)
 
 
 @torch.no_grad()
@@ -160,3 +214,14 @@ def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands)
         inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
         total += float(found[inner, around : size - around].sum())
     return total / (size - 2 * around) ** 2, clipped / size**2
+
+
+def _difference(height: np.ndarray, expected: np.ndarray, bands: Bands) -> tuple[float, float]:
+    """Mean and rms of one print minus the other, µm."""
+    total = square = 0.0
+    for band in bands.own():
+        off = np.asarray(height[band], np.float64) - expected[band]
+        total += float(off.sum())
+        square += float(np.square(off).sum())
+    pixels = bands.size_px**2
+    return total / pixels, float(np.sqrt(square / pixels))

@@ -137,10 +137,8 @@ def imaging_score(
 
     def add(name: str, estimates: Tensor) -> None:
         for estimate, wanted in zip(estimates, objects, strict=True):
-            found = similarity(estimate, wanted)
-            rows.setdefault(f"mae_{name}", []).append(found.mae)
-            rows.setdefault(f"psnr_{name}_db", []).append(found.psnr_db)
-            rows.setdefault(f"ssim_{name}", []).append(found.ssim)
+            for figure, value in similarity(estimate, wanted, name).items():
+                rows.setdefault(figure, []).append(value)
 
     for seed in _TEST_SEEDS:
         seen = record(objects, real, settings, seed)
@@ -187,13 +185,9 @@ def lens_baselines(
     if settings.task == "computational":
         imaging = settings.imaging
         objects = object_stack(imaging.test_objects, imaging.object_px, pictures)
-        black = [similarity(torch.zeros_like(wanted), wanted) for wanted in objects]
-        mae, psnr_db, ssim = (
-            sum(getattr(one, name) for one in black) / len(black) for name in ("mae", "psnr_db", "ssim")
-        )
-        found["black image"] = {"mae_direct": mae, "ssim_direct": ssim} | {
-            f"{name}_{by}{unit}": value
-            for by in ("design", "calibrated")
-            for name, unit, value in (("mae", "", mae), ("psnr", "_db", psnr_db), ("ssim", "", ssim))
-        }
+        black: dict[str, float] = {}
+        for by in ("direct", "design", "calibrated"):
+            rows = [similarity(torch.zeros_like(wanted), wanted, by) for wanted in objects]
+            black |= {name: sum(one[name] for one in rows) / len(rows) for name in rows[0]}
+        found["black image"] = {name: black[name] for name in black if name in ImagingScore.model_fields}
     return found

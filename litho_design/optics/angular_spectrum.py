@@ -6,18 +6,18 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
-from litho_design.optics.convolution import convolve
+from litho_design.optics.convolution import KernelPropagator, wrapped_order
 from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
 
 # 4096 pixels along both axes: half a gibibyte while the kernel is made.
 _LONGEST_PERIOD = 4096
 
 
-class ASMPropagator(nn.Module):
+class ASMPropagator(KernelPropagator):
     """Carry a complex field to a parallel plane with the transfer function of free space.
 
     H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)); the root is complex, so evanescent waves decay
@@ -41,8 +41,6 @@ class ASMPropagator(nn.Module):
         InputError: unequal pitches.
     """
 
-    transfer: Tensor
-
     def __init__(
         self,
         source: PixelGrid,
@@ -52,7 +50,6 @@ class ASMPropagator(nn.Module):
         *,
         dtype: torch.dtype = torch.complex64,
     ):
-        super().__init__()
         if any(abs(a - b) > 1e-12 * a for a, b in zip(source.pitch_um, target.pitch_um, strict=True)):
             raise InputError(
                 "output pitch of the angular spectrum method",
@@ -60,19 +57,9 @@ class ASMPropagator(nn.Module):
                 wanted=f"the source's pitch {source.pitch_um} µm",
                 hint="use RSPropagator for another pitch",
             )
-        self.source, self.target = source, target
         axes = spectrum_axes(source, target, distance_um, wavelength_um)
         kernel = torch.fft.ifft2(transfer_function(*axes, distance_um, wavelength_um))
-        transfer = torch.fft.fft2(kernel[axes[0].kept[:, None], axes[1].kept[None, :]])
-        self.register_buffer("transfer", transfer.to(dtype)[None, None], persistent=False)
-
-    def forward(self, field: Tensor) -> Tensor:
-        """Propagate complex ``field`` (..., ny, nx) to (..., my, mx)."""
-        return convolve(field.unsqueeze(-3), self.transfer, self.target.shape).squeeze(-3)
-
-    def adjoint(self, field: Tensor) -> Tensor:
-        """P^H of ``forward``: complex (..., my, mx) to (..., ny, nx)."""
-        return convolve(field.unsqueeze(-3), self.transfer.conj(), self.source.shape).squeeze(-3)
+        super().__init__(source, target, kernel[axes[0].kept[:, None], axes[1].kept[None, :]], dtype)
 
 
 @dataclass(frozen=True)
@@ -112,11 +99,11 @@ def _axis_band(
     source: PixelGrid, target: PixelGrid, axis: int, distance_um: float, wavelength_um: float
 ) -> SpectrumAxis:
     pitch, there, here = source.pitch_um[axis], target.shape[axis], source.shape[axis]
-    shortest = fast_length(here + there - 1)
+    index = wrapped_order(here, there)
     sine = min(wavelength_um / (2 * pitch), 1 - 1e-6)
     reach_um = abs(distance_um) * sine / math.sqrt(1 - sine**2)
     wanted = math.ceil((reach_um + largest_separation_um(source, target, axis)) / pitch) + 1
-    length = fast_length(max(shortest, min(wanted, _LONGEST_PERIOD)))
+    length = fast_length(max(len(index), min(wanted, _LONGEST_PERIOD)))
     frequency = torch.fft.fftfreq(length, pitch, dtype=torch.float64)
     start = first_centre_um(target, axis) - first_centre_um(source, axis)
     middle = start + (there - here) * pitch / 2
@@ -125,8 +112,5 @@ def _axis_band(
     # A ray comes back wrapped when it goes a period further than the far edge of the target.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
-    # Separations in wrapped order; unused places repeat a used one.
-    index = torch.arange(shortest)
-    index = torch.where(index < there, index, index - shortest).clamp(min=1 - here)
     # At zero distance nothing moves, evanescent waves included.
     return SpectrumAxis(frequency, inside | (distance_um == 0), index % length, start)

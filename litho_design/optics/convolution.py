@@ -5,20 +5,77 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from litho_data.foundation.grid import PixelGrid
+from litho_design.optics.sampling import fast_length
+
+
+class KernelPropagator(nn.Module):
+    """Carries a field from one plane to another: a convolution with a kernel.
+
+    The kernel lies on a grid that is finer than those of source and target by whole numbers.
+
+    Args:
+        kernel: complex128 (ky, kx) at the separations of ``wrapped_order``.
+        finer: how many pixels of the kernel make one of the source, and one of the target, each (y, x).
+        dtype: torch.complex64 or torch.complex128.
+    """
+
+    transfer: Tensor
+
+    def __init__(
+        self,
+        source: PixelGrid,
+        target: PixelGrid,
+        kernel: Tensor,
+        dtype: torch.dtype,
+        finer: tuple[tuple[int, int], tuple[int, int]] = ((1, 1), (1, 1)),
+    ):
+        super().__init__()
+        self.source, self.target, self._finer = source, target, finer
+        # Not persistent: it follows from the arguments, and a checkpoint must not carry it.
+        self.register_buffer("transfer", torch.fft.fft2(kernel).to(dtype), persistent=False)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Propagate complex ``field`` (..., ny, nx) to (..., my, mx)."""
+        here, there = self._finer
+        found = convolve(_spread(field, here), self.transfer, fine_shape(self.target.shape, there))
+        return found[..., :: there[0], :: there[1]]
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """P^H of ``forward``: complex (..., my, mx) to (..., ny, nx); it sends a field back."""
+        here, there = self._finer
+        found = convolve(_spread(field, there), self.transfer.conj(), fine_shape(self.source.shape, here))
+        return found[..., :: here[0], :: here[1]]
+
+
+def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
+    """Shape of a grid on pixels that are so many times finer, from its first centre to its last."""
+    rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
+    return rows, columns
+
+
+def wrapped_order(here: int, there: int) -> Tensor:
+    """Separations, pixels, between a source of ``here`` pixels and a target of ``there``, negative ones last.
+
+    Unused places repeat a used one.
+    """
+    length = fast_length(here + there - 1)
+    index = torch.arange(length)
+    return torch.where(index < there, index, index - length).clamp(min=1 - here)
 
 
 def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Tensor:
     """Convolve with a kernel given by its transform, and keep the first ``out_shape`` samples.
 
     Args:
-        field: complex (..., phases_in, ny, nx).
-        transfer: complex (phases_out, phases_in, ky, kx), FFT of the kernel stored in wrapped order
-            (sample 0 first, negative separations at the end); ky >= ny + my - 1, kx alike.
+        field: complex (..., ny, nx).
+        transfer: complex (ky, kx), FFT of the kernel in wrapped order; ky >= ny + my - 1, kx alike.
         out_shape: (my, mx).
 
     Returns:
-        complex (..., phases_out, my, mx).
+        complex (..., my, mx).
     """
     return _Convolution.apply(field, transfer, out_shape)
 
@@ -33,20 +90,21 @@ class _Convolution(torch.autograd.Function):
     def forward(ctx: Any, field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Tensor:
         ctx.save_for_backward(transfer)
         ctx.in_shape = (int(field.shape[-2]), int(field.shape[-1]))
-        return _apply(field, transfer, out_shape)
+        ky, kx = transfer.shape
+        spectrum = torch.fft.fft(torch.fft.fft(field, n=kx, dim=-1), n=ky, dim=-2).mul_(transfer)
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., : out_shape[0], :]
+        return torch.fft.ifft(rows, dim=-1)[..., : out_shape[1]].contiguous()
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (transfer,) = ctx.saved_tensors
-        return convolve(gradient, transfer.transpose(0, 1).conj(), ctx.in_shape), None, None
+        return convolve(gradient, transfer.conj(), ctx.in_shape), None, None
 
 
-def _apply(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Tensor:
-    ky, kx = transfer.shape[-2:]
-    spectrum = torch.fft.fft(torch.fft.fft(field, n=kx, dim=-1), n=ky, dim=-2)
-    if transfer.shape[0] == transfer.shape[1] == 1:
-        spectrum = spectrum.mul_(transfer[0])
-    else:
-        spectrum = (transfer * spectrum.unsqueeze(-4)).sum(-3)
-    rows = torch.fft.ifft(spectrum, dim=-2)[..., : out_shape[0], :]
-    return torch.fft.ifft(rows, dim=-1)[..., : out_shape[1]].contiguous()
+def _spread(field: Tensor, finer: tuple[int, int]) -> Tensor:
+    """A field on finer pixels, dark between its own."""
+    if finer == (1, 1):
+        return field
+    fine = field.new_zeros(*field.shape[:-2], *fine_shape(field.shape[-2:], finer))
+    fine[..., :: finer[0], :: finer[1]] = field
+    return fine

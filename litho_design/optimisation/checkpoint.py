@@ -51,14 +51,9 @@ def save_checkpoint(
     path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Stateful], seconds: float
 ) -> None:
     """Write the state of a search and of its parts; ``fingerprint`` says which task they belong to."""
-    content = {name: part.state_dict() for name, part in stateful.items()} | {
-        "fingerprint": fingerprint,
-        "iteration": state.iteration,
-        "best_loss": state.best_loss,
-        "best_levels": state.best_levels,
-        "history": state.history,
-        "seconds": seconds,
-    }
+    found = vars(state) | {"earlier_seconds": seconds}
+    states = {name: part.state_dict() for name, part in stateful.items()}
+    content = states | {"fingerprint": fingerprint, "found": found}
     with atomic_file(path) as temporary:
         torch.save(content, temporary)
 
@@ -81,12 +76,10 @@ def load_checkpoint(
         )
     for name, part in stateful.items():
         part.load_state_dict(content[name])
-    best_levels = content["best_levels"]
-    if best_levels is not None:
-        best_levels = best_levels.to(device)
-    return SearchState(
-        content["iteration"], content["best_loss"], best_levels, content["history"], content["seconds"]
-    )
+    state = SearchState(**content["found"])
+    if state.best_levels is not None:
+        state.best_levels = state.best_levels.to(device)
+    return state
 
 
 def checkpoint_path(folder: Path, part: str = "") -> Path:
@@ -97,7 +90,7 @@ def checkpoint_path(folder: Path, part: str = "") -> Path:
 def finished_iterations(folder: Path, part: str = "") -> int:
     """Finished iterations of an interrupted run in ``folder``; 0 without one."""
     path = checkpoint_path(folder, part)
-    return int(_load(path)["iteration"]) if path.exists() else 0
+    return int(_load(path)["found"]["iteration"]) if path.exists() else 0
 
 
 def remove_checkpoint(folder: Path, part: str = "") -> None:

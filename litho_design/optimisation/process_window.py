@@ -208,6 +208,8 @@ def measure_yield(
     Args:
         errors: figures that are better when lower.
     """
+    from scipy.stats import binomtest
+
     figures = [name for name in drawn[0] if name in modelled]
 
     def passes(name: str, value: float) -> bool:
@@ -218,12 +220,11 @@ def measure_yield(
         return value >= modelled[name] * window.pass_share
 
     passed = sum(all(passes(name, one[name]) for name in figures) for one in drawn)
-    count, z = len(drawn), 1.96
-    share = passed / count
-    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    interval = (max(0.0, middle - half), min(1.0, middle + half))
-    return Yield(draws=count, passed=passed, share=share, ci95=interval, figures=figures)
+    interval = binomtest(passed, len(drawn)).proportion_ci(method="wilson")
+    return Yield(
+        draws=len(drawn), passed=passed, share=passed / len(drawn),
+        ci95=(float(interval.low), float(interval.high)), figures=figures,
+    )  # fmt: skip
 
 
 def risk(losses: Tensor, window: ProcessWindow) -> Tensor:

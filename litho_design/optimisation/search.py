@@ -18,7 +18,7 @@ from litho_design.optimisation.checkpoint import (
     save_checkpoint,
 )
 from litho_design.optimisation.parameters import Parametrisation
-from litho_design.optimisation.rate import RateSchedule
+from litho_design.optimisation.rate import lower_rate, rate_schedule
 from litho_design.optimisation.settings import SearchSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
@@ -52,7 +52,7 @@ def search_layout(
     """
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate * parameters.rate_unit)
-    rate = RateSchedule(optimiser, settings)
+    rate = rate_schedule(optimiser, settings)
     stateful = {"parameters": parameters, "optimiser": optimiser, "rate": rate}
     state = SearchState()
     checkpoint = None if folder is None else checkpoint_path(folder, part)
@@ -62,7 +62,7 @@ def search_layout(
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):
         step_loss = _step(parameters, objective, optimiser, settings, iteration)
-        rate.after_step(step_loss)
+        lower_rate(rate, step_loss)
         state.iteration = iteration + 1
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
             _evaluate(parameters, objective, settings, state, step_loss)

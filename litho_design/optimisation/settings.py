@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
-
-from pydantic import model_validator
 
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
@@ -104,17 +102,8 @@ class EnsemblePenalty(Record):
     )
 
 
-# Settings of older designs that changed no figure of theirs.
-_GONE = (("search", "draft"), ("search", "draft_iterations"), ("fabrication", "trial_iterations"))
-
-
 class DesignSettings(Record):
     """What the settings of every design hold."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_what_is_gone(cls, content: Any) -> Any:
-        return without(content, _GONE)
 
     variant: Variant = setting(
         "default",
@@ -136,16 +125,6 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.
     """
     return changed(DesignSettings(), dict(changes or {}))
-
-
-def without(content: Any, paths: Iterable[tuple[str, ...]]) -> Any:
-    """Nested values, as read from a file, without those at some paths."""
-    for first, *rest in paths if isinstance(content, dict) else ():
-        if rest and first in content:
-            content = content | {first: without(content[first], [tuple(rest)])}
-        elif not rest:
-            content = {name: value for name, value in content.items() if name != first}
-    return content
 
 
 def check_variant(variant: str) -> None:

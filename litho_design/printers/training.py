@@ -25,8 +25,8 @@ class OutOfDistribution(Record):
 
     Two total-variation distances: between the histograms of levels, and between those of the steps of
     neighbouring pixels. ``unusual`` says what the layout has and they have not; ``inside`` holds the scores
-    of a layout that was kept closer to them, as printed, and the next two how close it came. All but the
-    levels is absent in older designs; steps also where the card of the model has none.
+    of a layout that was kept closer to them, as printed, and the next two how close it came. Steps are
+    absent where the card of the model has none.
     """
 
     level_distance: float

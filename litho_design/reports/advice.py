@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from litho_data.foundation.report import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
@@ -26,6 +27,19 @@ WORDS: Words = {
 }
 # Figures whose loss is told in dB: already in dB (0), shares of power (10).
 _IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10}
+# Figures that a score is told by, where it has them: what is said, decimals, and a factor.
+_HEADLINE: tuple[tuple[Any, ...], ...] = (
+    ("focusing_efficiency", "{} % in the focus", 1, 100),
+    ("strehl", "Strehl {}", 3),
+    ("eff_signal", "{} % on the signal", 1, 100),
+    ("si_psnr_db", "{} dB", 2),
+    ("ssim", "SSIM {}", 3),
+    ("si_psnr_window_db", "{} dB inside the signal window", 2),
+    ("rms_nm", "{} nm rms from the relief", 1),
+    ("mae_direct", "MAE direct {}", 4),
+    ("mae_design", "MAE design {}", 4),
+    ("mae_calibrated", "MAE calibrated {}", 4),
+)
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # Reflection alone takes 4.6 %.
 _THICK_SHARE = 0.1
@@ -145,44 +159,17 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """The two or three numbers of a score that a command ends with, with a measurement's uncertainty."""
+    """The few numbers of a score that a command ends with, with a measurement's uncertainty."""
     sd = uncertainty or {}
 
     def told(name: str, digits: int, scale: int = 1) -> str:
         more = f" ± {scale * sd[name]:.{digits}f}" if name in sd else ""
         return f"{scale * score[name]:.{digits}f}{more}"
 
-    if "focusing_efficiency" in score:
-        text = f"{told('focusing_efficiency', 1, 100)} % in the focus, Strehl {told('strehl', 3)}"
-        return text + (f", MAE {told('mae_calibrated', 4)}" if "mae_calibrated" in score else "")
-    if "si_psnr_db" in score:
-        text = f"{told('si_psnr_db', 2)} dB, SSIM {told('ssim', 3)}"
-        if "si_psnr_window_db" in score:
-            text += f", {told('si_psnr_window_db', 2)} dB inside the signal window"
-        return (f"{told('eff_signal', 1, 100)} % on the signal, " if "eff_signal" in score else "") + text
-    if "rms_nm" in score:
-        return f"{told('rms_nm', 1)} nm rms from the relief"
-    names = [name for name in ("direct", "design", "calibrated") if f"mae_{name}" in score]
-    if not names:
-        return ", ".join(f"{named(name)} {told(name, 4)}" for name in score)
-    return "MAE " + ", ".join(f"{name} {told(f'mae_{name}', 4)}" for name in names)
+    known = [form.format(told(key, *shown)) for key, form, *shown in _HEADLINE if key in score]
+    return ", ".join(known or [f"{named(name)} {told(name, 4)}" for name in score])
 
 
 def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
     """The headline figures of the baselines in one line."""
-    found = []
-    for name, figures in baselines.items():
-        shown = [
-            f"{figures[key] * scale:{form}}{unit}"
-            for key, scale, form, unit in (
-                ("focusing_efficiency", 100, ".1f", " % in the focus"),
-                ("eff_signal", 100, ".1f", " %"),
-                ("si_psnr_db", 1, ".2f", " dB"),
-                ("rms_nm", 1, ".1f", " nm rms"),
-            )
-            if key in figures
-        ]
-        shown += [f"SSIM {figures['ssim']:.3f}"] if "ssim" in figures else []
-        shown += [f"MAE {figures['mae_calibrated']:.4f}"] if "mae_calibrated" in figures else []
-        found.append(f"{name} {', '.join(shown or [f'{named(key)} {v:.4g}' for key, v in figures.items()])}")
-    return f"for comparison: {'; '.join(found)}"
+    return f"for comparison: {'; '.join(f'{name} {headline(one)}' for name, one in baselines.items())}"

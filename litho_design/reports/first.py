@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.printer import Printer
-from litho_design.reports.parts import BRIGHTEST
+from litho_design.reports.parts import picture_grid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,9 +50,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
     page.paragraph(
         "dB is the scale-invariant peak signal-to-noise ratio of the image: higher is better. The prints "
         f"are those that the model {DESIGNER} predicts. One of the layouts was designed through this very "
-        f"model, so its figure is an expectation and no measurement. In the prints of {JUDGE}, a model "
-        f"through which neither was designed, the images have {scores[WITHOUT, JUDGE]:.1f} dB without and "
-        f"{scores[DESIGNER, JUDGE]:.1f} dB with the model."
+        f"model, so its figure is an expectation and no measurement; through {JUDGE} neither was designed."
     )
     page.heading("Layouts and prints")
     page.figure(
@@ -85,32 +82,19 @@ def draw_images(
     assert first.target is not None
     pictures = {"wanted": first.target.cpu().numpy()}
     for arm, design in designs.items():
-        title = f"{_NAMES[arm]}: {scores[arm, DESIGNER]:.1f} dB"
+        title = f"{_NAMES[arm]}:\n{scores[arm, DESIGNER]:.1f} dB"
         pictures[title] = design.display(design.image(design.printed_um(printer)))
-    figure = new_figure(10.5, 3.8)
-    for axis, (title, picture) in zip(figure.subplots(1, len(pictures)), pictures.items(), strict=True):
-        axis.imshow(picture, cmap="inferno", vmin=0, vmax=BRIGHTEST)
-        axis.set_title(title, fontsize=11)
-        axis.set_axis_off()
-    return figure
+    return picture_grid({"": pictures}, first.window_um)
 
 
 def _draw_prints(designs: Mapping[str, LoadedDesign], printer: Printer) -> Figure:
     layout = next(iter(designs.values())).record.layout
-    highest_um = (layout.levels - 1) * layout.level_height_um
-    figure = new_figure(8.6, 7.4)
-    axes = figure.subplots(len(designs), 2)
-    for (arm, design), row in zip(designs.items(), axes, strict=True):
-        maps = {
-            "layout": design.level * layout.level_height_um,
-            f"its print, predicted by {printer.name}": design.printed_um(printer),
+    rows = {
+        _NAMES[arm]: {
+            "layout": (design.level * layout.level_height_um).cpu().numpy(),
+            f"its print, predicted by {printer.name}": design.printed_um(printer).cpu().numpy(),
         }
-        for axis, (title, height_um) in zip(row, maps.items(), strict=True):
-            extent = (0, layout.size_um, layout.size_um, 0)
-            shown = axis.imshow(height_um.cpu().numpy(), vmin=0, vmax=highest_um, extent=extent)
-            axis.set_title(title, fontsize=9)
-        row[0].set_ylabel(_NAMES[arm])
-    for axis in axes[-1]:
-        axis.set_xlabel("x, µm")
-    figure.colorbar(shown, ax=axes.ravel().tolist(), label="height, µm", shrink=0.8)
-    return figure
+        for arm, design in designs.items()
+    }
+    highest_um = (layout.levels - 1) * layout.level_height_um
+    return picture_grid(rows, layout.size_um, "viridis", highest_um, "height, µm")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,13 +17,18 @@ from litho_design.judging.loaded import LoadedDesign, task_named
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
 from litho_design.reports.advice import WORDS, baseline_line, named
-from litho_design.reports.parts import image_grid, meanings
+from litho_design.reports.parts import meanings, picture_grid
 from litho_design.tasks.design import Design
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Side of the cut-out that shows layout against print; features of some pixels must stay visible.
 _DETAIL_PX = 160
 # With fewer, an interval over seeds is missing or says nothing.
 _FEWEST_SEEDS = 3
+# Of each arm a design, and the image that each judge's print gives.
+_Judged = dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
@@ -82,8 +87,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     )
     page.figure(
         _prints(result, judged, printers),
-        f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
-        "range of its row.",
+        f"Seed {result.seeds[0]}: layout and prints in the middle of the element, all on one scale.",
     )
     if result.task.startswith("lens-"):
         page.figure(
@@ -96,12 +100,17 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         "First: expected in design (circles) and after each judge's print (bars), means over seeds. Second: "
         "design minus print, the gap.",
     )
-    page.heading("Arm against arm", folded=True)
-    page.paragraph(
-        "Differences under the same judge, paired by seed. Where the interval includes 0, the order is open."
-    )
-    page.table(_paired_columns(result), "Paired differences", "paired.csv", digits=3)
-    page.table(_all_means(result), "All means", "summary.csv", digits=4)
+    if result.paired:
+        page.heading("Arm against arm", folded=True)
+        page.paragraph("Differences under the same judge, paired by seed. If 0 is inside, the order is open.")
+        pairs = [
+            one.model_dump(exclude={"ci95"})
+            | dict(zip(("95 % from", "to"), one.ci95 or (np.nan, np.nan), strict=True))
+            for one in result.paired
+        ]
+        page.table(pairs, "Paired differences", "paired.csv", digits=3)
+    means = [one.model_dump(exclude={"judged_ci95"}) for one in result.summary]
+    page.table(means, "All means", "summary.csv", digits=4)
     return page.write(folder)
 
 
@@ -165,9 +174,7 @@ def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _judged(
-    folder: Path, result: GapResult, printers: Mapping[str, Printer]
-) -> dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]:
+def _judged(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> _Judged:
     """For every arm the image (or PSF) that each judge's print gives, first seed."""
     images = {}
     for arm, own in printers.items():
@@ -181,44 +188,33 @@ def _judged(
     return images
 
 
-def _pictures(judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
-    images, titles, side_um = [], [], 0.0
-    for arm, (loaded, by_judge) in judged.items():
-        images.append([loaded.display(image) for image in by_judge.values()])
-        titles.append(
-            [f"{arm}:\nin design" if name == arm else f"{arm}:\nprinted by {name}" for name in by_judge]
-        )
-        side_um = loaded.window_um
-    return image_grid(images, titles, list(judged), side_um)
+def _pictures(judged: _Judged) -> Figure:
+    rows = {
+        arm: {
+            f"{arm}:\n{'in design' if name == arm else f'printed by {name}'}": loaded.display(image)
+            for name, image in by_judge.items()
+        }
+        for arm, (loaded, by_judge) in judged.items()
+    }
+    return picture_grid(rows, next(iter(judged.values()))[0].window_um)
 
 
-def _prints(
-    result: GapResult,
-    judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]],
-    printers: Mapping[str, Printer],
-):
+def _prints(result: GapResult, judged: _Judged, printers: Mapping[str, Printer]) -> Figure:
     """The layout (nominal heights) and what every judge prints of it, cut out around the centre."""
     layout = result.settings.layout
     side = min(layout.size_px, _DETAIL_PX)
     first = (layout.size_px - side) // 2
     middle = (slice(first, first + side), slice(first, first + side))
-    extent = (0, side * layout.pitch_um, side * layout.pitch_um, 0)
-    figure = new_figure(2.3 * (len(printers) + 1) + 0.6, 2.45 * len(judged))
-    axes = figure.subplots(len(judged), len(printers) + 1, squeeze=False)
-    for (arm, (loaded, _)), row in zip(judged.items(), axes, strict=True):
-        maps = {"layout, nominal": loaded.level.cpu().numpy() * layout.level_height_um}
-        maps |= {f"printed by {name}": loaded.printed_um(p).cpu().numpy() for name, p in printers.items()}
-        highest = max(float(height[middle].max()) for height in maps.values())
-        for axis, (name, height) in zip(row, maps.items(), strict=True):
-            shown = axis.imshow(height[middle], cmap="viridis", vmin=0, vmax=highest, extent=extent)
-            axis.set_title(name, fontsize=10)
-            axis.tick_params(labelsize=8)
-        row[0].set_ylabel(f"designed with {arm}", fontsize=10)
-        figure.colorbar(shown, ax=row.tolist(), label="µm", shrink=0.8)
-    return figure
+    rows = {}
+    for arm, (loaded, _) in judged.items():
+        maps = {"layout, nominal": loaded.level * layout.level_height_um}
+        maps |= {f"printed by {name}": loaded.printed_um(printer) for name, printer in printers.items()}
+        rows[f"designed with {arm}"] = {name: one.cpu().numpy()[middle] for name, one in maps.items()}
+    highest_um = max(float(one.max()) for maps in rows.values() for one in maps.values())
+    return picture_grid(rows, side * layout.pitch_um, "viridis", highest_um, "height, µm")
 
 
-def _profiles(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
+def _profiles(result: GapResult, judged: _Judged) -> Figure:
     figure = new_figure(9, 2.6 * len(judged))
     axes = figure.subplots(len(judged), 2, squeeze=False, sharey="col")
     for (arm, (_, by_judge)), (left, right) in zip(judged.items(), axes, strict=True):
@@ -239,7 +235,7 @@ def _profiles(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str,
     return figure
 
 
-def _bars(result: GapResult, name: str):
+def _bars(result: GapResult, name: str) -> Figure:
     """Left: one figure in design and after each judge's print; right: what the print cost of it."""
     figure = new_figure(12, 3.8)
     left, right = figure.subplots(1, 2)
@@ -262,30 +258,3 @@ def _bars(result: GapResult, name: str):
         axis.set_xlabel("printed by")
     figure.legend(title="designed with", ncols=len(arms), fontsize=8, loc="outside upper center")
     return figure
-
-
-def _paired_columns(result: GapResult) -> dict[str, list[Any]]:
-    unknown = float("nan"), float("nan")
-    # By column: with a single arm there is no pair, and the table keeps its names.
-    return {
-        "judge": [item.judge for item in result.paired],
-        "figure": [item.figure for item in result.paired],
-        "difference": [f"{item.arm} − {item.against}" for item in result.paired],
-        "mean": [item.mean for item in result.paired],
-        "95 % from": [(item.ci95 or unknown)[0] for item in result.paired],
-        "to": [(item.ci95 or unknown)[1] for item in result.paired],
-    }
-
-
-def _all_means(result: GapResult) -> list[dict[str, Any]]:
-    return [
-        {
-            "arm": item.arm,
-            "judge": item.judge,
-            "figure": item.figure,
-            "in design": item.designed_mean,
-            "after printing": item.judged_mean,
-            "gap": item.gap_mean,
-        }
-        for item in result.summary
-    ]

@@ -177,30 +177,33 @@ def add_gauge(page: Page, design: Design) -> None:
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 
 
-def image_grid(
-    images: list[list[np.ndarray]], titles: list[list[str]], row_labels: list[str], side_um: float
+def picture_grid(
+    rows: Mapping[str, Mapping[str, np.ndarray]],
+    side_um: float,
+    colours: str = "inferno",
+    highest: float = BRIGHTEST,
+    unit: str = "",
 ) -> Figure:
-    """Intensity images in rows and columns on one scale.
+    """Pictures in rows and columns, all of them on one scale from 0.
 
     Args:
-        images: rows of images (m, m) at the scale of the target.
-        titles: one title per image.
-        row_labels: left of each row.
-        side_um: extent of every image, µm.
+        rows: label of each row to its pictures (m, m), by title.
+        side_um: extent of every picture, µm.
+        highest: value of the brightest colour, that of white in the target by default.
+        unit: of a colour bar; none without it.
     """
-    rows, columns = len(images), max(len(row) for row in images)
-    two_lines = any("\n" in name for names in titles for name in names)
-    figure = new_figure(2.3 * columns + 0.6, (2.6 if two_lines else 2.45) * rows)
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for axis in axes.flat:
-        axis.set_xticks([])
-        axis.set_yticks([])
-        axis.axis("off")
-    for row, (pictures, names) in enumerate(zip(images, titles, strict=True)):
-        for column, (picture, name) in enumerate(zip(pictures, names, strict=True)):
-            axis = axes[row, column]
-            axis.axis("on")
-            axis.imshow(picture, cmap="inferno", vmin=0, vmax=BRIGHTEST, extent=(0, side_um, side_um, 0))
-            axis.set_title(name, fontsize=10)
-        axes[row, 0].set_ylabel(row_labels[row], fontsize=10)
+    columns = max(map(len, rows.values()))
+    two_lines = any("\n" in title for row in rows.values() for title in row)
+    figure = new_figure(2.3 * columns + 0.6 + bool(unit), (2.6 if two_lines else 2.45) * len(rows))
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for own, (label, pictures) in zip(axes, rows.items(), strict=True):
+        for axis, (title, picture) in zip(own, pictures.items(), strict=True):
+            extent = (0, side_um, side_um, 0)
+            shown = axis.imshow(picture, cmap=colours, vmin=0, vmax=highest, extent=extent)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_title(title, fontsize=10)
+        own[0].set_ylabel(label, fontsize=10)
+    if unit:
+        figure.colorbar(shown, ax=axes.ravel().tolist(), label=unit, shrink=0.8)
     return figure

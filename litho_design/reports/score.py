@@ -5,30 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from litho_data.foundation.report import Page
 from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
-from litho_design.judging.score import ScoreResult
+from litho_design.judging.score import Judgement, ScoreResult
 from litho_design.reports.advice import WORDS, headline
-from litho_design.reports.parts import image_grid, meanings, score_table
+from litho_design.reports.parts import meanings, picture_grid, score_table
 
 
-def write_score_report(
-    folder: Path,
-    result: ScoreResult,
-    pictures: dict[str, np.ndarray],
-    side_um: float,
-    photos: dict[str, np.ndarray],
-    frame_um: float,
-) -> Path:
-    """Write ``report.html`` and ``scores.csv``.
-
-    Args:
-        pictures: wanted image, image or PSF (m, m) behind each print, ``side_um`` wide.
-        photos: object, photograph and reconstructions of a lens (n, n), ``frame_um`` wide.
-    """
+def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) -> Path:
+    """Write ``report.html`` and ``scores.csv``."""
     page = Page(
         "Score of a printable layout",
         f"Designed through “{result.designed_with.name}”, printed by "
@@ -39,13 +25,13 @@ def write_score_report(
     )
     page.verdict(_verdict(result))
     page.figure(
-        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
+        picture_grid({"": judgement.pictures}, judgement.side_um),
         "The wanted image, and behind each print the image at matched scale; of a lens the square root of "
         "the PSF.",
     )
-    if photos:
+    if judgement.photos:
         page.figure(
-            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
+            picture_grid({"": judgement.photos}, judgement.frame_um),
             "Photograph through the printed lens, each image at the scale of least error. The scores are of "
             "this one object.",
         )

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
@@ -19,7 +19,6 @@ from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.budget import peak_memory_gib
 from litho_design.optimisation.disagreement import EnsembleRecord
-from litho_design.optimisation.settings import without
 from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
@@ -95,11 +94,6 @@ class Design(Findings, Result):
     polished_loss: float
     width: Width | None = None
     files: dict[str, str]
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_what_is_gone(cls, content: Any) -> Any:
-        return without(content, [("printer_unchanged",)])
 
     @property
     def in_rings(self) -> bool:

@@ -14,6 +14,9 @@ from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.loaded import load_design
 from litho_design.judging.measured import MeasuredSource, measured_print
+from litho_design.large.bands import Bands, Ranks
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.lens import RingLens
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import lens_task
@@ -41,6 +44,7 @@ def design_hologram(
     ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = False,
+    band_px: int | None = None,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -57,6 +61,9 @@ def design_hologram(
         judges: models that print the finished layout, the width of the design; those of the zoo that were
             trained on the same prints by default.
         robust: search with the judges for the layout whose worst loss is the lowest, instead of printing it.
+        band_px: rows of a band at most: designs in bands, for elements beyond the memory of a process. Those
+            that torchrun starts share them; with ``cuda`` each takes a GPU of its own. The one model has a
+            finite reach then, and nothing else prints the layout.
         device: where models are loaded.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting.
@@ -69,9 +76,15 @@ def design_hologram(
             fit the layout, or a folder that holds another result.
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
+    if band_px is not None:
+        judges, ranks = _alone(ensemble, judges, robust), Ranks.joined()
+        bands = Bands(made.layout.size_px, band_px, ranks, made.layout.cell_px)
+        device = ranks.device(device)
 
     def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
         wanted = load_target(target, made.layout.size_px)
+        if band_px is not None:
+            return BandedHologram(made, printer, wanted, bands)
         return HologramTask(_over_worst(made, worst), printer, wanted, others)
 
     return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
@@ -87,6 +100,7 @@ def design_lens(
     ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = False,
+    tile_px: int | None = None,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -99,6 +113,8 @@ def design_lens(
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
+        tile_px: designs the rings of a lens that focuses light along a radius, in tiles of this length;
+            nothing of the plane is made, up to 10 mm and more. The model has a finite reach then.
         ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
@@ -109,8 +125,12 @@ def design_lens(
             square aperture; or objects that are not pictures.
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
+    if tile_px is not None:
+        judges = _alone((*ensemble, *objects, *held_out_objects), judges, robust)
 
     def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+        if tile_px is not None:
+            return RingLens(made, printer, tile_px)
         imaging, pictures = with_objects(_over_worst(made, worst), objects, held_out_objects)
         return lens_task(imaging, printer, others, pictures)
 
@@ -248,6 +268,14 @@ def _designed(
     task = make(printer, others + in_search, bool(in_search))
     task.judges = [one for one in rivals if one not in in_search]
     return run_design(task, out, write_design_report, announce=announce)
+
+
+def _alone(others: Iterable[Any], judges: Iterable[Any] | None, robust: bool) -> tuple[()]:
+    """The judges of a large element: none."""
+    if robust or tuple(others) or judges:
+        got = "objects, an ensemble or judges"
+        raise InputError("large element", got=got, wanted="one design through one model")
+    return ()
 
 
 def _over_worst(settings: S, worst: bool) -> S:

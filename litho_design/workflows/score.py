@@ -9,13 +9,14 @@ from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
+from litho_design.large.lens import judge_rings
+from litho_design.large.score import judge_from_disk
 from litho_design.optics.thin_element import ElementKind
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.score import write_score_report
 from litho_design.tasks.design import Design
-from litho_design.workflows.large import score_rings
 
 
 def score(
@@ -27,6 +28,7 @@ def score(
     camera: PhotoSource | None = None,
     element: ElementKind | None = None,
     stitch: Stitching | None = None,
+    band_px: int | None = None,
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> ScoreResult:
@@ -45,6 +47,7 @@ def score(
         element: ``thick`` judges every print by the wave propagation method; ignored for a design that is
             loaded.
         stitch: write fields that the prints of the judges are made of, each off its place.
+        band_px: rows of a band at most, to score a hologram of any size band by band, the rest on disk.
         device: where prints and waves are computed; ignored for a design that is loaded.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
@@ -52,23 +55,30 @@ def score(
         InputError: nothing to judge with, an incomplete or altered design folder, a measurement that
             does not match it, or an ``out`` that holds another kind of result.
     """
-    if not isinstance(design, LoadedDesign) and Design.read(design).in_rings:
-        if any(one is not None for one in (scan, camera, element, stitch)):
-            given = "a scan, a photograph, another element or write fields"
-            raise InputError("score of a lens in rings", got=given, wanted="models as judges")
-        return score_rings(design, out, judges=judges, device=device, extrapolate=extrapolate)
-    loaded = (
-        design if isinstance(design, LoadedDesign) else LoadedDesign(design, device=device, element=element)
-    )
-    record = loaded.record
-    printers = load_printers(judges, record.layout, device=loaded.device, extrapolate=extrapolate)
+    loaded = design if isinstance(design, LoadedDesign) else None
+    folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
+    record = Design.read(folder) if loaded is None else loaded.record
+    in_parts = band_px is not None or record.in_rings
+    if in_parts and any(one is not None for one in (loaded, scan, camera, element)):
+        given = "a scan, a photograph, another element or a design in memory"
+        raise InputError("score of a large element", got=given, wanted="models as judges")
+    if record.in_rings and (stitch is not None or band_px is not None):
+        raise InputError("score of a lens in rings", got="write fields or bands", wanted="neither")
+    if loaded is None and not in_parts:
+        loaded = LoadedDesign(folder, device=device, element=element)
+    if loaded is not None:
+        record, device = loaded.record, loaded.device
+    printers = list(load_printers(judges, record.layout, device=device, extrapolate=extrapolate).values())
     if not printers and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
     with growing_folder(out, ScoreResult.FILE_NAME):
-        judgement = judge_design(loaded, list(printers.values()), scan, camera, stitch)
-        result = ScoreResult.of(loaded.folder, record, judgement.scores)
-        wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
-        shown = wanted | {title: loaded.display(image) for title, image in judgement.pictures.items()}
-        write_score_report(Path(out), result, shown, loaded.window_um, judgement.photos, loaded.frame_um)
+        if loaded is not None:
+            judgement = judge_design(loaded, printers, scan, camera, stitch)
+        elif band_px is None:
+            judgement = judge_rings(folder, record, printers)
+        else:
+            judgement = judge_from_disk(folder, record, printers, band_px, stitch, Path(out))
+        result = ScoreResult.of(folder, record, judgement.scores)
+        write_score_report(Path(out), result, judgement)
         result.write(out)
     return result

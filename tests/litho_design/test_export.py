@@ -61,7 +61,7 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
     assert sidecar.nominal_height_um[-1] == pytest.approx(1.2)
     assert sidecar.layout_sha256 == Design.read(design).files["layout_level.npy"]
     raw = json.loads(sidecar_path(file).read_text())
-    assert {"wavelength_um", "settings", "printability", "predicted_height_um", "polarity"} <= raw.keys()
+    assert {"settings", "printability", "stroke", "polarity"} <= raw.keys()
 
 
 @pytest.mark.parametrize(("suffix", "step"), [(".png", 65535 // 12), (".bmp", 255 // 12)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from litho_data.foundation.grid import PixelGrid
 from litho_design.images.targets import load_target
 from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
@@ -23,7 +22,6 @@ GRID = centred_grid((32, 32), 0.1)
 TARGETS = {
     "same": GRID,
     "rational": centred_grid((20, 33), 0.15, (5.0, 0.0)),
-    "dense": PixelGrid((13, 21), (0.1 * 2**0.5, 0.1), (-3.0, 1.0)),
 }
 
 

@@ -32,7 +32,7 @@ from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, RING_HEIGHT_FILE, RINGS_FILE, Design
-from litho_design.workflows.large import design_large_lens, score_from_disk
+from litho_design.workflows.design import design_lens
 from litho_design.workflows.score import score
 from tests.litho_design import large_rank
 from tests.litho_design.conftest import BlurPrinter
@@ -147,7 +147,7 @@ def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alon
 
 def test_a_score_from_disk_is_that_of_the_whole(alone, tmp_path):
     design, printer = alone / "design", large_rank.printer()
-    (streamed,) = score_from_disk(design, tmp_path / "disk", judges=[printer], band_px=48).scores
+    (streamed,) = score(design, tmp_path / "disk", judges=[printer], band_px=48).scores
     (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
     assert len(streamed.figures) == 10
     for name, value in streamed.figures.items():
@@ -167,7 +167,7 @@ def test_displaced_write_fields_are_judged_alike_in_memory_and_from_disk(alone, 
     moved = in_fields(plain, 0.1, 40, stitch.offsets_um(SIZE, 0.1, [0]))
     wanted = loaded.score(moved).model_dump()
     folders = (tmp_path / "disk", tmp_path / "whole")
-    (streamed,) = score_from_disk(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
+    (streamed,) = score(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
     for name, value in streamed.figures.items():
         # As without fields: rounding of waves, in figures that are sums of squares of them.
         assert value == pytest.approx(wanted[name], rel=1e-4, abs=1e-7), name
@@ -272,7 +272,7 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     # A circle of square pixels against true rings: a pixel of the edge in 128, twice, in power.
     assert found[1].focusing_efficiency == pytest.approx(whole[1].focusing_efficiency, rel=1 / 64)
     assert found[1].fwhm_um == pytest.approx(whole[1].fwhm_um, rel=1 / 64)
-    design = design_large_lens(printer, tmp_path, settings=settings, tile_px=48, announce=False)
+    design = design_lens(printer, tmp_path, settings=settings, tile_px=48, announce=False)
     assert design.argmax_loss < design.start_loss
     level, height = (np.load(tmp_path / name) for name in (RINGS_FILE, RING_HEIGHT_FILE))
     assert level.shape == height.shape == (128,)
@@ -295,8 +295,8 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     assert nominal.rms_height_difference_um == pytest.approx(rms, rel=1e-4)
     changed = settings.model_copy(update={"search": settings.search.model_copy(update={"iterations": 7})})
     with pytest.raises(InputError, match=r"other settings, search\.iterations"):
-        design_large_lens(printer, tmp_path, settings=changed, tile_px=48, announce=False)
-    with pytest.raises(InputError, match="got a scan, a photograph, another element or write fields"):
+        design_lens(printer, tmp_path, settings=changed, tile_px=48, announce=False)
+    with pytest.raises(InputError, match="got write fields or bands"):
         score(tmp_path, tmp_path / "fields", judges=[printer], stitch=Stitching(sigma_um=0.1))
     (tmp_path / RINGS_FILE).write_bytes(b"")
     with pytest.raises(InputError, match="a file changed after the design"):

@@ -14,11 +14,12 @@ from scipy.ndimage import map_coordinates
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
+from litho_design.images.photograph import PhotoSource
 from litho_design.images.similarity import matched_scale, similarity
 from litho_design.images.targets import TargetRecord
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredSource
-from litho_design.judging.photographs import PhotoSource, score_lens_photo
+from litho_design.judging.photographs import score_lens_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.lenses.bench import reconstruct, sensor_psf
 from litho_design.lenses.objects import object_stack, read_object
@@ -132,10 +133,10 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
         "calibrated": estimate(loaded, seen, psf, wanted),
     }.items():
         gradient = np.hypot(*np.gradient(image.numpy()))
-        ideal = similarity(image, wanted)
+        ideal = similarity(image, wanted, name)
         change = float(displaced_px * gradient.mean() + NOISE / WHITE)
-        assert score.figures[f"mae_{name}"] == pytest.approx(ideal.mae, abs=change)
-        rms, rms_ideal = (10 ** (-db / 20) for db in (score.figures[f"psnr_{name}_db"], ideal.psnr_db))
+        assert score.figures[f"mae_{name}"] == pytest.approx(ideal[f"mae_{name}"], abs=change)
+        rms, rms_ideal = (10 ** (-one[f"psnr_{name}_db"] / 20) for one in (score.figures, ideal))
         change = float(displaced_px * np.sqrt(np.square(gradient).mean()) + NOISE / WHITE)
         assert rms == pytest.approx(rms_ideal, abs=change)
     # Only calibration knows the PSF that made the photograph.
@@ -203,9 +204,9 @@ def test_the_command_tells_the_errors(tmp_path, lens, picture, monkeypatch, caps
     assert stop.value.code == 0
     score = ScoreResult.read(tmp_path / "score").scores[0]
     told = ", ".join(
-        f"{name} {score.figures[f'mae_{name}']:.4f} ± {score.uncertainty[f'mae_{name}']:.4f}"
+        f"MAE {name} {score.figures[f'mae_{name}']:.4f} ± {score.uncertainty[f'mae_{name}']:.4f}"
         for name in ("direct", "design")
     )
-    assert f"camera photo.png: MAE {told}" in capsys.readouterr().out
+    assert f"camera photo.png: {told}" in capsys.readouterr().out
     table = (tmp_path / "score" / "scores.csv").read_text()
     assert "psnr_direct_db" in table

@@ -48,7 +48,6 @@ GRIDS = {
     "fine": centred_grid((31, 32), 0.05, (-0.4, 2.0)),
     "rational": centred_grid((20, 33), 0.15, (5.0, 0.0)),
     "mixed": PixelGrid((13, 21), (0.25, 0.04), (-3.0, 1.0)),
-    "incommensurate": centred_grid((32, 32), 0.1 * math.sqrt(2), (0.05, -1.0)),
 }
 
 
@@ -271,6 +270,8 @@ def test_distance_below_the_sampling_limit_is_refused():
         RSPropagator(coarse, coarse, 0.99 * limit, WAVELENGTH_UM)
     with pytest.raises(InputError, match="at least"):
         RSPropagator(coarse, coarse, -5.0, WAVELENGTH_UM)
+    with pytest.raises(InputError, match="a ratio of integers"):
+        RSPropagator(coarse, centred_grid((32, 32), 0.4 * math.sqrt(2)), 1.1 * limit, WAVELENGTH_UM)
 
 
 def test_draft_pitch_is_close_inside_the_window():

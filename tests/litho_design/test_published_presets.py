@@ -16,7 +16,7 @@ from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, lens_settings
 from litho_design.lenses.task import lens_task, strip_rings
 from litho_design.optimisation.parameters import CellMap, GumbelLevels, make_parametrisation
-from litho_design.optimisation.rate import RateSchedule
+from litho_design.optimisation.rate import lower_rate, rate_schedule
 from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
@@ -150,12 +150,12 @@ def test_a_soft_sample_is_the_expected_level_of_equation_a2(temperature):
 def test_the_rate_halves_by_time_or_falls_where_nothing_is_gained():
     def rates(losses, **schedule):
         optimiser = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=8.0)
-        rate = RateSchedule(optimiser, SearchSettings(**schedule))
+        rate = rate_schedule(optimiser, SearchSettings(**schedule))
         found = []
         for loss in losses:
             found.append(optimiser.param_groups[0]["lr"])
             optimiser.step()
-            rate.after_step(loss)
+            lower_rate(rate, loss)
         return found
 
     halved = rates([1.0] * 7, rate_schedule="step", rate_factor=0.5, rate_iterations=3)
