@@ -65,7 +65,7 @@ def _show_all(context: typer.Context, asked: bool) -> None:
 
 
 HelpAll = Annotated[
-    bool, typer.Option("--help-all", help="Show the other options too.", is_eager=True, callback=_show_all)
+    bool, typer.Option("--help-all", help="show the other options too", is_eager=True, callback=_show_all)
 ]
 
 

@@ -104,8 +104,9 @@ def test_a_folder_keeps_the_run_that_it_holds(before, now, differs, trained, sto
 
 def test_a_killed_run_keeps_its_folder_from_models_that_leave_no_checkpoint(trained, store, tmp_path):
     shutil.copytree(trained[1] / "checkpoint", tmp_path / "checkpoint")
-    config = {"model": "pbl", "config": trained[0].config.model_dump(mode="json")}
-    (tmp_path / BEGUN).write_text(json.dumps({"record": "run.json", **config}))
+    facts = {"dataset": trained[0].dataset.model_dump(mode="json"), "model": "pbl"}
+    facts["config"] = trained[0].config.model_dump(mode="json")
+    (tmp_path / BEGUN).write_text(json.dumps({"record": "run.json", **facts}))
     with pytest.raises(InputError, match="model = 'pbl' where now 'affine'"):
         train(store, "affine", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [BEGUN, "checkpoint"]

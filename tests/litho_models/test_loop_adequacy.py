@@ -90,5 +90,5 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     large, minor = causes
     assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
     found = Found(state, causes)
-    assert _larger(minor, found, without, study) == corrected
-    assert _larger(large, found, without, study) == ""
+    assert _larger(minor, found, study) == corrected
+    assert _larger(large, found, study) == ""

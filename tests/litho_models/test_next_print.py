@@ -382,10 +382,9 @@ def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
     assert plan.run.command in measured_plan.PAGE.read_text(encoding="utf-8")
 
 
-def test_the_plan_for_the_measured_prints_is_ready_and_of_the_published_loop() -> None:
+def test_the_plan_for_the_measured_prints_is_ready_and_of_their_dataset() -> None:
     plan = NextPrint.read(measured_plan.RESULTS)
-    loop = json.loads((DOCS / "results" / "neural-lithography" / "close_loop.json").read_text("utf-8"))
-    assert plan.dataset.model_dump(mode="json") == loop["dataset"]
+    assert plan.dataset == CloseLoop.read(DOCS / "results" / "neural-lithography" / "causes").dataset
     jobs = jobs_of_card(measured_plan.RESULTS / "card.toml", first=0)
     assert [job.id for job in jobs] == [scan.id for scan in plan.scans]
 
