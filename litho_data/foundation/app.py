@@ -69,6 +69,14 @@ HelpAll = Annotated[
 ]
 
 
+def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
+    """Give a function that takes ``**values`` the signature that typer is to see."""
+    # Typer reads both.
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
+
+
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that hides some of its options ``--help-all``, which shows them."""
 
@@ -80,11 +88,7 @@ def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
     kind = inspect.Parameter.KEYWORD_ONLY
     own = inspect.signature(command, eval_str=True).parameters.values()
     shown = [*own, inspect.Parameter("help_all", kind, default=False, annotation=HelpAll)]
-    shown = [one.replace(kind=kind) for one in shown]
-    # Typer reads both.
-    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in shown}
-    return run
+    return takes(run, [one.replace(kind=kind) for one in shown])
 
 
 def new_app(help_text: str) -> typer.Typer:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 import typer
 from pydantic import BaseModel
 
-from litho_data.foundation.app import with_further_options
+from litho_data.foundation.app import takes, with_further_options
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
@@ -171,10 +171,7 @@ def takes_settings(
 
         own = inspect.signature(command, eval_str=True).parameters.values()
         shown = [*(parameter for parameter in own if parameter.name != "given"), *extra]
-        # Typer reads both.
-        run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
-        run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
-        return with_further_options(run)
+        return with_further_options(takes(run, shown))
 
     return decorate
 

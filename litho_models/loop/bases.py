@@ -57,7 +57,7 @@ def choose_base(
         return Base(base, model, {})
     settings: dict[str, Any] = {"seed": study.seed} if steps is None else {"seed": study.seed, "steps": steps}
     trainer = partial(_trained, base, TrainingConfig.of_recipe("fast", base, **settings), cache)
-    return Base(base, train_folds(prepare_scans(scans), study.fold_of, trainer, study.workers), {})
+    return Base(base, train_folds(scans, study.fold_of, trainer, study.workers), {})
 
 
 def _best(scans: Sequence[PrintedScan], study: Study) -> Base:

@@ -7,8 +7,9 @@ other scan. Whatever is judged on scans is chosen without them by calling it on 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from torch import nn
@@ -141,9 +142,14 @@ def close(
     freed = freed_scans(scans, first, plain)
     at_work = replace(plain, scans=prepare_scans(freed))
     start = fit_state(first.twin, at_work)
+
+    @cache
+    def learner() -> Learner:
+        return Learner(at_work, held_out_maps(start, at_work, at_work.scans))
+
     excluded = untestable(at_work)
     causes = [one for one in screened_effects(at_work.tip_radius_um) if one.name not in excluded]
-    named, checked = _named(start, at_work, causes)
+    named, checked = _named(start, at_work, causes, learner)
     study.report("looking for a law in what is left")
     lawful = search(named.state, at_work, list(LAWS.values()), MOST_LAWS)
     described: list[Cause] = []
@@ -160,18 +166,19 @@ def close(
         checked=checked,
         lawful=lawful,
         described=described,
-        rests=_rests(stages, at_work) if describe else {},
+        rests=_rests(stages, at_work, learner()) if describe else {},
         untestable=excluded,
     )
 
 
-def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Found, list[Checked]]:
+def _named(
+    start: State, study: Study, candidates: Sequence[Effect], learner: Callable[[], Learner]
+) -> tuple[Found, list[Checked]]:
     """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
     found = search(start, study, candidates)
     failed: list[Checked] = []
-    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
-    while learner and found.causes:
-        left_nm2 = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2
+    while found.causes:
+        left_nm2 = learner().rest(held_out_maps(found.state, study, study.scans)).mean_nm2
         checked = [_checked(cause, found, left_nm2, study) for cause in found.causes]
         found.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
@@ -255,14 +262,13 @@ def fit_with_measurement(
     return twin, learned
 
 
-def _rests(stages: dict[str, State], study: Study) -> dict[str, Rest]:
-    learner, rests = None, {}
+def _rests(stages: dict[str, State], study: Study, learner: Learner) -> dict[str, Rest]:
+    """What could still be learned beside each stage that changes the model."""
+    rests: dict[str, Rest] = {}
     seen: list[State] = []
     for name, state in stages.items():
         if any(state is other for other in seen):
             continue
         seen.append(state)
-        maps = held_out_maps(state, study, study.scans)
-        learner = learner or Learner(study, maps)
-        rests[name] = learner.rest(maps)
+        rests[name] = learner.rest(held_out_maps(state, study, study.scans))
     return rests

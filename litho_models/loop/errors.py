@@ -16,7 +16,7 @@ from litho_models.loop.fits import State, Study, fit_state, prepared_among
 from litho_models.loop.judging import judge
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.record import ErrorRow, MeasuredBy, Stage
+from litho_models.loop.record import ErrorRow, MeasuredBy, Stage, error_of
 from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.groups import ALL
@@ -167,9 +167,10 @@ class HeldOut:
         return ("base", self.closed.base), ("all", self.closed.final)
 
     def _mae_nm(self, state: State) -> float:
-        """k = 1, the printer as it was fitted beside the others' measurement, which is learned anew."""
-        rows = self._rows("all", "shared", "scans", *self._by_fold(state, refit=False))
-        return next(row.mae_nm for row in rows if row.policy == "offset")
+        """Mean absolute error, k = 1: the printer as it stands, the measurement learned again beside it."""
+        row = error_of(self._rows("all", "shared", "scans", *self._by_fold(state, refit=False)), "all")
+        assert row is not None
+        return row.mae_nm
 
     def _rows(
         self, model: Stage, measurement: MeasuredBy, held_out: Any, maps: Maps, numbers: tuple[int, int]

@@ -10,7 +10,6 @@ from torch import nn
 from litho_data.foundation.commands import progress
 from litho_data.foundation.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
-from litho_models.loop.prepared import PreparedScan
 
 # Where other processes train, it is sent to them.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
@@ -32,8 +31,8 @@ class FoldedBase(nn.Module):
         self.eval()
 
     def of_fold(self, fold: int) -> nn.Module:
-        """The model trained without this fold; one that was trained elsewhere stands for all folds."""
-        return self.models[min(fold, len(self.models) - 1)]
+        """The model trained without this fold."""
+        return self.models[fold]
 
     def of_scan(self, scan_id: str) -> nn.Module:
         """The model that has not seen this scan."""
@@ -42,13 +41,13 @@ class FoldedBase(nn.Module):
 
 
 def train_folds(
-    scans: Sequence[PreparedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
+    scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
     """Train once without each fold and once on all development scans."""
     folds = range(int(fold_of.max()) + 1)
     # No scan has the number of the last one.
     jobs = [
-        (fold, trainer, [scan.stored for scan, own in zip(scans, fold_of, strict=True) if own != fold])
+        (fold, trainer, [scan for scan, own in zip(scans, fold_of, strict=True) if own != fold])
         for fold in (*folds, len(folds))
     ]
     done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")

@@ -87,7 +87,6 @@ class Learner:
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
-        self._predictions = list(predictions)
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)

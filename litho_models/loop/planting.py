@@ -36,14 +36,15 @@ def parse_planted(text: str) -> tuple[Effect, float]:
     return effect, amount
 
 
-def plant(text: str, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]) -> Planted:
+def plant(
+    effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
+) -> Planted:
     """Plant an effect beside the base in copies of the scans, and see what a new loop names.
 
     Args:
-        text: of ``parse_planted``; ``closed``: what was found on the scans as they are.
+        effect, amount: of ``parse_planted``; ``closed``: what was found on the scans as they are.
         close_again: the same loop on other scans.
     """
-    effect, amount = parse_planted(text)
     amplitude = effect.amplitudes[0]
     values = {effect.name: {**effect.off_values(), amplitude: amount}}
     placed = closed.base.twin.placed()

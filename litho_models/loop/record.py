@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -227,12 +228,17 @@ class CloseLoop(Result):
         held_out: str = "scans",
     ) -> ErrorRow | None:
         """One row of the errors; None if it was not measured."""
-        for row in self.errors:
-            if (row.model, row.policy, row.measurement, row.held_out) == (
-                model,
-                policy,
-                measurement,
-                held_out,
-            ):
-                return row
-        return None
+        return error_of(self.errors, model, policy, measurement, held_out)
+
+
+def error_of(
+    errors: Sequence[ErrorRow],
+    model: Stage,
+    policy: Policy = "offset",
+    measurement: MeasuredBy = "shared",
+    held_out: str = "scans",
+) -> ErrorRow | None:
+    """The row of some errors with these terms; None if there is none."""
+    wanted = model, policy, measurement, held_out
+    rows = (row for row in errors if (row.model, row.policy, row.measurement, row.held_out) == wanted)
+    return next(rows, None)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
-from litho_models.fitting.least_squares import Linearised, eliminated
+from litho_models.fitting.least_squares import Linearised, eliminated, eliminated_sum
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, State
 from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
@@ -25,6 +25,7 @@ from litho_models.loop.record import (
     ScanFinding,
     Strength,
     Verdict,
+    error_of,
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
@@ -57,14 +58,9 @@ def record(
         _found(closed, one, left_out_nm, survives_on)
         for one in (*closed.causes, *closed.lawful.causes, *closed.described)
     ]
-    before, after = (
-        next(
-            row
-            for row in errors
-            if (row.model, row.policy, row.measurement, row.held_out) == (stage, "offset", "shared", "scans")
-        )
-        for stage in ("base", "all")
-    )
+    before, after = error_of(errors, "base"), error_of(errors, "all")
+    assert before is not None
+    assert after is not None
     gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
@@ -216,12 +212,14 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 def confounded(state: State) -> list[tuple[str, str, float]]:
     """Pairs of fitted numbers that these scans determine together only, with their correlation."""
     twin = state.twin
-    normal = np.sum([eliminated(part, RULES.term_weight)[0] for part in state.linear], axis=0)
+    normal = eliminated_sum(state.linear, RULES.term_weight)[0]
     free = np.flatnonzero(np.diag(normal) > 0)
     covariance = np.linalg.pinv(normal[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sd, sd)
-    own = [*_values(twin)] if len(_values(twin)) == twin.own else [f"base {i}" for i in range(twin.own)]
+    own = [*_values(twin)]
+    if len(own) != twin.own:
+        own = [f"base {i}" for i in range(twin.own)]
     names = [*own, *(" ".join(filter(None, (s.effect, s.parameter, s.label))) for s in twin.slots)]
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation), 1) >= _CONFOUNDED), strict=True)
     return [(names[free[i]], names[free[j]], float(correlation[i, j])) for i, j in pairs]

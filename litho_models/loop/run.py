@@ -78,8 +78,7 @@ def close_loop(
     require_replaceable_folder(
         out, CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE
     )
-    for text in inject:
-        parse_planted(text)
+    wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
     development, locked, dropped = _usable_scans(opened)
     with kept_open(Workers(workers, dask)) as places:
@@ -94,7 +93,7 @@ def close_loop(
         errors = held_out.errors()
         often: dict[str, int] = {}
         left_out_nm, survives_on = held_out.left_out_nm(), held_out.survives_on(chosen.others)
-        planted = [plant(text, closed, _again(chosen.model, study)) for text in inject]
+        planted = [plant(*one, closed, _again(chosen.model, study)) for one in wanted]
         if nested:
             rows, often = _nested(development, chosen.model, study, nested)
             errors += rows

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class Freed:
 
     fits: Sequence[CrossFit]
 
-    @property
+    @cached_property
     def squares_nm2(self) -> np.ndarray:
         """(scans,) mean squared error."""
         return np.array([NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in self.fits])
@@ -178,8 +178,7 @@ class SingleScans:
         """
         if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
             return list(self.maps_um)
-        residuals = [self._smooth(scan, own) for scan, own in zip(self.scans, self.maps_um, strict=True)]
-        totals = np.stack([one.sum(axis=axis) for one in residuals])
+        totals = np.stack([one.sum(axis=axis) for one in self._smooth_um])
         seen = np.stack([scan.usable.sum(axis=axis) for scan in self.scans])
         found = []
         for fold, own in zip(self.study.fold_of, self.maps_um, strict=True):
@@ -192,10 +191,10 @@ class SingleScans:
         """The period that the means of lines have in common, such as that of mains hum, in words."""
         (term,) = line_terms(terms_of_effect(name))
         means = []
-        for scan, own in zip(self.scans, self.maps_um, strict=True):
+        for scan, residual in zip(self.scans, self._smooth_um, strict=True):
             assert term.lines is not None
             line, use = term.lines(scan.usable.shape, scan.line), scan.usable
-            count, total = np.bincount(line[use]), np.bincount(line[use], self._smooth(scan, own)[use])
+            count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
             means.append(total / np.maximum(count, 1))
         found = line_period(means, self.scans[0].stored.pitch_um)
         if found is None or found.p > _PERIOD_P:
@@ -206,9 +205,13 @@ class SingleScans:
             f"(p = {found.p:.1g})"
         )
 
-    def _smooth(self, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-        """Residual (y, x), µm, without datum and bow, 0 where not measured."""
-        return freed_um(scan.stored.height_um, prediction, scan.usable, _SMOOTH)
+    @cached_property
+    def _smooth_um(self) -> list[np.ndarray]:
+        """Residual (y, x) of each scan without datum and bow, 0 where not measured."""
+        return [
+            freed_um(scan.stored.height_um, own, scan.usable, _SMOOTH)
+            for scan, own in zip(self.scans, self.maps_um, strict=True)
+        ]
 
 
 def _as_variance(before: Freed, after: Freed, study: Study) -> Judgement:

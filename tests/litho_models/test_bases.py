@@ -23,7 +23,6 @@ from litho_models.loop.errors import HeldOut
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.folded_base import FoldedBase, train_folds
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.run import close_loop
 from litho_models.loop.search import search
 from litho_models.models import build_model
@@ -76,7 +75,7 @@ def trained(scans: Sequence[PrintedScan]) -> Simulator:
 def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]:
     return {
         "fitted here": base_model(),
-        "trained per fold": train_folds(prepare_scans(scans), study.fold_of, trained),
+        "trained per fold": train_folds(scans, study.fold_of, trained),
     }
 
 
