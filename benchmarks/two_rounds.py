@@ -52,7 +52,7 @@ DEALT = (
     "diffusion-blur",
     "slope-thinning",
 )
-# The board is about what prints decide: one base, the form of the fab's own.
+# The board tests what new prints decide, so the base has the form of the fab's own printer.
 BASE = "physics"
 SCANS, PRINTS = 14, 4
 RMS_NM = (12.0, 30.0)

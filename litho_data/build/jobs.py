@@ -21,6 +21,8 @@ from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
+# Width of the rim of level 0 around a field that is alone on the substrate. Models extend the edge of a layout.
+_BARE_PX = 2
 
 
 class Job(Protocol):
@@ -56,10 +58,6 @@ def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
         return Skipped(job.id, str(error))
     unfinished.add(piece)
     return piece.record
-
-
-# A field that is alone on the substrate gets a rim of level 0: models go on as a layout ends.
-_BARE_PX = 2
 
 
 @dataclass(frozen=True)

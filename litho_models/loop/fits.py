@@ -101,7 +101,7 @@ class State:
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_nm2: np.ndarray
-    # What it is without one of its effects: asked for by every step that judges the effect.
+    # The model without each of its effects: several steps ask for the same one.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property

@@ -77,7 +77,7 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Rivals, and none of them, fitted to all scans and judged on the new ones."""
+        """Fit every rival, and a model without any, to all scans; judge them on the new ones."""
         twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]

@@ -35,7 +35,7 @@ from litho_models.scan_terms.groups import ALL
 
 # Members of a set, or suspects: every pair of rivals is compared on every layout.
 _MOST_MEMBERS = 3
-# Of a layout whose spectrum can be told.
+# Smallest layout whose spectrum is measured, and the share of its power below the cut-off.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
@@ -64,7 +64,7 @@ def open_questions(
 
 
 def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
-    """Up to where most of the power of the layouts lies, cycles/µm."""
+    """The frequency below which most of the power of the layouts lies, cycles/µm."""
     first, layouts = scans[0], [scan.mask_level for scan in scans]
     if min(first.shape) < _SMALLEST_PX:
         return 0.05 / first.pitch_um

@@ -47,7 +47,7 @@ def test_a_step_in_a_box_is_the_best_one_in_it() -> None:
     step = solve_damped(normal, right, 0.0, (lowest, highest))
     assert ((step >= lowest) & (step <= highest)).all()
     slope = (normal @ step - right) / np.sqrt(np.diag(normal))
-    # lsq_linear ends at a relative tolerance of 1e-10; the regularisation of the factor is as small.
+    # lsq_linear stops at a relative tolerance of 1e-10, and the factor is regularised by as little.
     size = 1e-6 * np.abs(right / np.sqrt(np.diag(normal))).max()
     inside = (step > lowest + 1e-9) & (step < highest - 1e-9)
     assert inside[3]

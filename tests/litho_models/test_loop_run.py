@@ -348,7 +348,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
     locked = locked_ids(scans)
     # Drawn with this seed, or from the scans that are left, the box would be another.
     assert lock_box([s.id for s in scans], [s.print_id for s in scans], 1, seed=2) != locked
-    # Next to nothing of the locked scan was measured, so that it is dropped.
+    # Hardly any pixel of the locked scan is measured, so it is dropped.
     corner = np.zeros(scans[0].shape, bool)
     corner[:4, :4] = True
     empty = [replace(s, valid=corner) if s.id in locked else s for s in scans]
