@@ -21,7 +21,7 @@ from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Width of the rim of level 0 around a field that is alone on the substrate. Models extend the edge of a layout.
+# Rim of level 0 around a field that is alone on the substrate: models extend the edge of a layout.
 _BARE_PX = 2
 
 
