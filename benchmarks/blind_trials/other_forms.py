@@ -143,7 +143,7 @@ def _oriented_proximity(rng: np.random.Generator) -> Law:
     )
 
 
-@_form("halo-ring", "dose", "1", 3.0)
+@_form("halo-ring", "dose", "1", 1.0)
 def _halo_ring(rng: np.random.Generator) -> Law:
     """Dose thrown onto a ring of 4–9 µm radius, relative to the focused dose."""
     radius_um = rng.uniform(4, 9)
