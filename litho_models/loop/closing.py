@@ -49,12 +49,14 @@ class Checked:
         cause: what was added; ``reshaped_nm2``: what its change in other shapes would take beside it.
         left_nm2: what all features of layout and place still explain beside everything named.
         corrects: a much larger cause whose formula it may only correct; empty if none.
+        exhausted: its amplitudes that stand at the far end of their range.
     """
 
     cause: Cause
     reshaped_nm2: float
     left_nm2: float = 0.0
     corrects: str = ""
+    exhausted: Sequence[str] = ()
 
     @property
     def gain_nm2(self) -> float:
@@ -75,6 +77,8 @@ class Checked:
         """Why the name does not stand; empty if it does."""
         if self.corrects:
             return f"may only correct the formula of {self.corrects}"
+        if self.exhausted:
+            return f"the scans ask for more of it than there can be: {', '.join(self.exhausted)}"
         if self.reshaped_share > FORM_SHARE and self.reshaped_nm2 > LEFT_SHARE * self.left_nm2:
             share = 100 * self.reshaped_share
             return (
@@ -201,7 +205,9 @@ def _checked(cause: Cause, found: Found, left_nm2: float, study: Study) -> Check
     without = found.state.without(cause.name, study)
     cause = replace(cause, judgement=judge(without.freed_nm2, found.state.freed_nm2, study))
     reshaped_nm2 = reshaped_gain(without, found.state, study)
-    return Checked(cause, reshaped_nm2, left_nm2, _larger(cause, found, study))
+    return Checked(
+        cause, reshaped_nm2, left_nm2, _larger(cause, found, study), found.state.twin.exhausts(cause.name)
+    )
 
 
 def _larger(cause: Cause, found: Found, study: Study) -> str:

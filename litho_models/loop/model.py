@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from litho_models.effects import get_effect
+from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
@@ -190,7 +190,7 @@ class Twin:
         """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
         steps = _BASE_STEP * np.maximum(np.abs(self.vector), 0.2)
         for at, slot in enumerate(self.slots, self.own):
-            facts = get_effect(slot.effect).parameters[slot.parameter]
+            facts = _facts(slot)
             usual = facts.typical - (facts.null if facts.kind == "amplitude" else 0.0)
             size = _EFFECT_STEP * abs(usual)
             steps[at] = size if self.vector[at] + size <= facts.upper else -size
@@ -202,7 +202,7 @@ class Twin:
         if self.own:
             lowest[: self.own], highest[: self.own] = parameter_room(self.base, self.vector[: self.own])
         for at, slot in enumerate(self.slots, self.own):
-            facts = get_effect(slot.effect).parameters[slot.parameter]
+            facts = _facts(slot)
             lowest[at], highest[at] = facts.lower - self.vector[at], facts.upper - self.vector[at]
         return np.minimum(lowest, 0), np.maximum(highest, 0)
 
@@ -215,12 +215,25 @@ class Twin:
         """Fitted values of base and effects that stand on a bound of their range, and that bound."""
         placed = self.placed().base
         found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
-        for at, slot in enumerate(self.slots, self.own):
-            facts = get_effect(slot.effect).parameters[slot.parameter]
-            for bound in (facts.lower, facts.upper):
-                if abs(self.vector[at] - bound) < _AT_BOUND * max(1.0, abs(bound)):
-                    found[f"{slot.effect}: {slot.parameter}"] = bound
+        for slot, bound in self._on_bounds():
+            found[f"{slot.effect}: {slot.parameter}"] = bound
         return found
+
+    def exhausts(self, name: str) -> list[str]:
+        """Amplitudes of an effect that stand at the far end of their range: the scans ask for more."""
+        return [
+            slot.parameter
+            for slot, bound in self._on_bounds()
+            if slot.effect == name and _facts(slot).kind == "amplitude" and bound != _facts(slot).null
+        ]
+
+    def _on_bounds(self) -> list[tuple[Slot, float]]:
+        return [
+            (slot, bound)
+            for slot, value in zip(self.slots, self.vector[self.own :].tolist(), strict=True)
+            for bound in (_facts(slot).lower, _facts(slot).upper)
+            if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound))
+        ]
 
 
 class Placed:
@@ -281,6 +294,10 @@ def is_refitted(base: nn.Module) -> bool:
     """Whether the base has parameters, and few enough to be fitted together with the effects."""
     trainable = any(p.requires_grad for p in base.parameters())
     return trainable and is_small(base) and not isinstance(base, FoldedBase)
+
+
+def _facts(slot: Slot) -> Parameter:
+    return get_effect(slot.effect).parameters[slot.parameter]
 
 
 def _parameters(base: nn.Module) -> Sequence[nn.Parameter]:

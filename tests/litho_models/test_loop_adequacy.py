@@ -46,20 +46,21 @@ def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reshaped_nm2", "left_nm2", "corrects", "said"),
+    ("reshaped_nm2", "left_nm2", "corrects", "exhausted", "said"),
     [
-        (1.4, 0.0, "", ""),  # 14 % of its gain in other shapes
-        (1.6, 5.0, "", "takes 16 % of its gain"),
-        (1.6, 5.4, "", ""),  # more than twice as much again is left for causes that are missing
-        (0.0, 0.0, "galvo-lag", "may only correct the formula of galvo-lag"),
+        (1.4, 0.0, "", [], ""),  # 14 % of its gain in other shapes
+        (1.6, 5.0, "", [], "takes 16 % of its gain"),
+        (1.6, 5.4, "", [], ""),  # more than twice as much again is left for causes that are missing
+        (0.0, 0.0, "galvo-lag", [], "may only correct the formula of galvo-lag"),
+        (0.0, 0.0, "", ["fraction"], "more of it than there can be: fraction"),
     ],
 )
 def test_the_limits_of_a_name_are_those_that_are_written(
-    reshaped_nm2: float, left_nm2: float, corrects: str, said: str
+    reshaped_nm2: float, left_nm2: float, corrects: str, exhausted: list[str], said: str
 ) -> None:
     judgement = judge(np.full(10, 100.0), np.full(10, 90.0), Study((), np.empty(0)))
     cause = Cause("slope-thinning", ALL, (), judgement, 0.01, None)
-    one = Checked(cause, reshaped_nm2, left_nm2, corrects)
+    one = Checked(cause, reshaped_nm2, left_nm2, corrects, exhausted)
     assert one.gain_nm2 == pytest.approx(10)
     assert said in one.reason
     assert one.holds is (said == "")

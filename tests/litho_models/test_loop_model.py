@@ -157,6 +157,8 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert ends.free()[:2].all()
     # Both groups and the axis that is off stand on a bound of the same name.
     assert set(ends.at_bounds()) == {f"{THINNING}: along_x_um", f"{THINNING}: along_y_um"}
+    # An amplitude at its null asks for nothing.
+    assert ends.exhausts(THINNING) == ["along_x_um"]
 
 
 def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
