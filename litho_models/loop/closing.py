@@ -49,7 +49,7 @@ class Checked:
         cause: what was added; ``reshaped_nm2``: what its change in other shapes would take beside it.
         left_nm2: what all features of layout and place still explain beside everything named.
         corrects: a much larger cause whose formula it may only correct; empty if none.
-        exhausted: its amplitudes that stand at the far end of their range.
+        exhausted: its amplitudes whose fit ends at the limit of their range.
     """
 
     cause: Cause

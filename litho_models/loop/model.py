@@ -32,6 +32,11 @@ class Slot:
     parameter: str
     label: str | None
 
+    @property
+    def facts(self) -> Parameter:
+        """What the catalogue says of the number."""
+        return get_effect(self.effect).parameters[self.parameter]
+
 
 @dataclass(frozen=True)
 class Twin:
@@ -178,8 +183,7 @@ class Twin:
                     for other, one in enumerate(self.slots)
                     if seen[other] and (one.effect, one.parameter) == (slot.effect, slot.parameter)
                 ]
-                null = get_effect(slot.effect).parameters[slot.parameter].null
-                vector[self.own + at] = np.mean(alike) if alike else null
+                vector[self.own + at] = np.mean(alike) if alike else slot.facts.null
         return self.at(vector)
 
     def placed(self) -> Placed:
@@ -190,7 +194,7 @@ class Twin:
         """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
         steps = _BASE_STEP * np.maximum(np.abs(self.vector), 0.2)
         for at, slot in enumerate(self.slots, self.own):
-            facts = _facts(slot)
+            facts = slot.facts
             usual = facts.typical - (facts.null if facts.kind == "amplitude" else 0.0)
             size = _EFFECT_STEP * abs(usual)
             steps[at] = size if self.vector[at] + size <= facts.upper else -size
@@ -202,7 +206,7 @@ class Twin:
         if self.own:
             lowest[: self.own], highest[: self.own] = parameter_room(self.base, self.vector[: self.own])
         for at, slot in enumerate(self.slots, self.own):
-            facts = _facts(slot)
+            facts = slot.facts
             lowest[at], highest[at] = facts.lower - self.vector[at], facts.upper - self.vector[at]
         return np.minimum(lowest, 0), np.maximum(highest, 0)
 
@@ -220,18 +224,19 @@ class Twin:
         return found
 
     def exhausts(self, name: str) -> list[str]:
-        """Amplitudes of an effect that stand at the far end of their range: the scans ask for more."""
-        return [
+        """Amplitudes of an effect that some group has at a limit of their range other than the null."""
+        found = [
             slot.parameter
             for slot, bound in self._on_bounds()
-            if slot.effect == name and _facts(slot).kind == "amplitude" and bound != _facts(slot).null
+            if slot.effect == name and slot.facts.kind == "amplitude" and bound != slot.facts.null
         ]
+        return [*dict.fromkeys(found)]
 
     def _on_bounds(self) -> list[tuple[Slot, float]]:
         return [
             (slot, bound)
             for slot, value in zip(self.slots, self.vector[self.own :].tolist(), strict=True)
-            for bound in (_facts(slot).lower, _facts(slot).upper)
+            for bound in (slot.facts.lower, slot.facts.upper)
             if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound))
         ]
 
@@ -294,10 +299,6 @@ def is_refitted(base: nn.Module) -> bool:
     """Whether the base has parameters, and few enough to be fitted together with the effects."""
     trainable = any(p.requires_grad for p in base.parameters())
     return trainable and is_small(base) and not isinstance(base, FoldedBase)
-
-
-def _facts(slot: Slot) -> Parameter:
-    return get_effect(slot.effect).parameters[slot.parameter]
 
 
 def _parameters(base: nn.Module) -> Sequence[nn.Parameter]:

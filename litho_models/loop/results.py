@@ -176,7 +176,7 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
                 Strength(
                     label=slot.label or "",
                     value=value,
-                    unit=effect.parameters[slot.parameter].unit,
+                    unit=slot.facts.unit,
                     ci95=(value - half, value + half) if sd[at] else None,
                 )
             )

@@ -159,6 +159,8 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert set(ends.at_bounds()) == {f"{THINNING}: along_x_um", f"{THINNING}: along_y_um"}
     # An amplitude at its null asks for nothing.
     assert ends.exhausts(THINNING) == ["along_x_um"]
+    vector[3] = facts["along_x_um"].upper
+    assert twin.at(vector).exhausts(THINNING) == ["along_x_um"]
 
 
 def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
