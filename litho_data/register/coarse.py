@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from litho_data.foundation.kinds import Array
-from litho_data.register.features import Correspondence, match_blocks, match_features
+from litho_data.register.features import Correspondence, match_features
 from litho_data.register.geometry import (
     ORIENTATIONS,
     apply_transform,
@@ -23,7 +23,6 @@ CLEAR_MARGIN = 0.1
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
-MIN_BLOCK_AGREEMENT = 0.5
 SEARCH_BLUR_PX = 2.0
 
 
@@ -32,14 +31,18 @@ class CoarseFit:
     """Where the scan lies, to a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
-    ``method`` is what found it: ``orb``, ``sift``, ``blocks``, or ``correlation`` when no points were usable.
+    ``points`` is None where too few keypoints match: the best correlation over all shifts is the fit then.
     """
 
     orientation: str
     polarity: int
     layout_to_oriented: Array
-    method: str
     points: Correspondence | None
+
+    @property
+    def method(self) -> str:
+        """What found it: ``orb`` or ``correlation``."""
+        return "orb" if self.points else "correlation"
 
 
 def find_coarse(
@@ -66,11 +69,11 @@ def find_coarse(
     if not hypotheses:
         return None
     best = _upright_if_tied(hypotheses)
-    for method, orientation, polarity in _attempts(best, hypotheses) if features else ():
-        fit = _fit_features(method, scan, layout_level, orientation, polarity, seed)
+    for orientation, polarity in _families(best, hypotheses) if features else ():
+        fit = _fit_features(scan, layout_level, orientation, polarity, seed)
         if fit is not None and fit.orientation in allowed[0]:
             return fit
-    return _fit_without_features(scan, layout_level, best, seed)
+    return CoarseFit(best.orientation, best.polarity, best.layout_to_oriented, None)
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
@@ -83,28 +86,28 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
     return best
 
 
-def _attempts(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, str, int]]:
-    """(method, orientation, polarity) to try in turn.
+def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
+    """Orientations and polarities to look for keypoints in.
 
-    ORB and SIFT do not depend on rotation, so only the four combinations of mirror image and polarity
-    differ; all are tried if the correlation leaves the orientation open.
+    ORB does not depend on rotation, so only the four combinations of mirror image and polarity differ; all
+    are tried if the correlation leaves the orientation open.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
     if best is not hypotheses[0] or best.ncc - max(rivals, default=-1.0) >= CLEAR_MARGIN:
-        return [("orb", *own), ("sift", *own)]
+        return [own]
     families: dict[tuple[int, int], tuple[str, int]] = {}
     for hypothesis in hypotheses:
         handedness = round(np.linalg.det(orientation_matrix(hypothesis.orientation, (1, 1))))
         families.setdefault((handedness, hypothesis.polarity), (hypothesis.orientation, hypothesis.polarity))
-    return [*(("orb", *family) for family in families.values()), ("sift", *own)]
+    return [*families.values()]
 
 
 def _fit_features(
-    method: str, scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
+    scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
     """A fit from matched keypoints, or None if its inliers are too few or too clustered."""
-    points = match_features(method, polarity * orient(scan, orientation), layout_level, seed)
+    points = match_features(polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:
         return None
     shape = scan.shape
@@ -119,14 +122,4 @@ def _fit_features(
     overlap = overlap_of(warp, layout_shape, orient(np.isfinite(scan), found))
     if points.coverage(overlap) < MIN_COVERAGE:
         return None
-    return CoarseFit(found, polarity, warp, method, points)
-
-
-def _fit_without_features(scan: Array, layout_level: Array, hypothesis: Hypothesis, seed: int) -> CoarseFit:
-    orientation, polarity = hypothesis.orientation, hypothesis.polarity
-    points = match_blocks(
-        polarity * orient(scan, orientation), layout_level, hypothesis.layout_to_oriented, seed
-    )
-    if points is not None and points.inlier.mean() >= MIN_BLOCK_AGREEMENT:
-        return CoarseFit(orientation, polarity, points.layout_to_scan, "blocks", points)
-    return CoarseFit(orientation, polarity, hypothesis.layout_to_oriented, "correlation", None)
+    return CoarseFit(found, polarity, warp, points)

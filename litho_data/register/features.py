@@ -1,7 +1,6 @@
 """Coarse registration without an assumption about position: matched points and a robust affine."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,7 @@ FAST_THRESHOLD = 5
 LAYOUT_BLUR_PX = 3.0
 SCAN_BLUR_PX = 1.5
 INLIER_PX = 3.0
-BLOCK_PX = 96
-BLOCK_SEARCH_PX = 32
+_FEWEST_MATCHES = 6
 _ROWS_AT_ONCE = 32
 
 
@@ -29,7 +27,6 @@ class Correspondence:
     inside the convex hull of the inliers; ``keypoints`` is the smaller count of the two images.
     """
 
-    method: str
     keypoints: int
     layout_points: Array
     scan_points: Array
@@ -49,11 +46,10 @@ class Correspondence:
         return float(np.sqrt(((moved - found) ** 2).sum(axis=1).mean()))
 
 
-def match_features(method: str, scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
-    """Keypoints of both images (ORB or SIFT), cross-checked matches and a MAGSAC affine.
+def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
+    """Keypoints of both images by ORB, cross-checked matches and a MAGSAC affine.
 
     Args:
-        method: ``orb`` or ``sift``.
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
         layout_level: (ny, nx) integer levels.
         seed: of the robust estimator.
@@ -61,33 +57,37 @@ def match_features(method: str, scan: Array, layout_level: Array, seed: int) -> 
     Returns:
         None if there are too few matches or no affine fits them.
 
-    ORB: E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544. SIFT: D. G. Lowe, IJCV 60 (2004),
-    doi:10.1023/B:VISI.0000029664.99615.94. MAGSAC++: D. Barath et al., CVPR 2020,
+    ORB: E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544. MAGSAC++: D. Barath et al., CVPR 2020,
     doi:10.1109/CVPR42600.2020.00138.
     """
     import cv2
 
     scan_image = _contrast_image(fill_gaps(smooth_measured(scan, SCAN_BLUR_PX)))
     layout_image = _contrast_image(predicted_topography(layout_level, LAYOUT_BLUR_PX))
-    detector: Any
-    if method == "orb":
-        detector = cv2.ORB.create(nfeatures=FEATURE_COUNT, fastThreshold=FAST_THRESHOLD)
-    else:
-        detector = cv2.SIFT.create(nfeatures=FEATURE_COUNT, contrastThreshold=0.01)
+    detector = cv2.ORB.create(nfeatures=FEATURE_COUNT, fastThreshold=FAST_THRESHOLD)
     measured = np.isfinite(scan).astype(np.uint8) * 255
     scan_keys, scan_descriptors = detector.detectAndCompute(scan_image, measured)
     layout_keys, layout_descriptors = detector.detectAndCompute(layout_image, None)
     if scan_descriptors is None or layout_descriptors is None:
         return None
-    if method == "orb":
-        layout_index, scan_index = match_bits(layout_descriptors, scan_descriptors)
-    else:
-        matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(layout_descriptors, scan_descriptors)
-        layout_index, scan_index = np.array([(m.queryIdx, m.trainIdx) for m in matches], int).reshape(-1, 2).T
-    layout_points = np.array([layout_keys[k].pt for k in layout_index]).reshape(-1, 2)
-    scan_points = np.array([scan_keys[k].pt for k in scan_index]).reshape(-1, 2)
+    layout_index, scan_index = match_bits(layout_descriptors, scan_descriptors)
+    if len(layout_index) < _FEWEST_MATCHES:
+        return None
+    layout_points = np.array([layout_keys[k].pt for k in layout_index])
+    scan_points = np.array([scan_keys[k].pt for k in scan_index])
+    cv2.setRNGSeed(seed)
+    affine, inlier = cv2.estimateAffine2D(
+        layout_points, scan_points, method=cv2.USAC_MAGSAC, ransacReprojThreshold=INLIER_PX, maxIters=5000
+    )
+    if affine is None or not np.isfinite(affine).all():
+        return None
+    inlier = np.asarray(inlier).reshape(-1).astype(bool)
+    if inlier.sum() < 3 or abs(np.linalg.det(affine[:, :2])) < 1e-3:
+        return None
+    hull_px2 = float(cv2.contourArea(cv2.convexHull(layout_points[inlier].astype(np.float32))))
+    matrix = np.vstack([affine, [0.0, 0.0, 1.0]])
     keypoints = min(len(scan_keys), len(layout_keys))
-    return _robust_affine(method, keypoints, layout_points, scan_points, seed)
+    return Correspondence(keypoints, layout_points, scan_points, inlier, matrix, hull_px2)
 
 
 def match_bits(first: Array, second: Array) -> tuple[Array, Array]:
@@ -119,39 +119,6 @@ def match_bits(first: Array, second: Array) -> tuple[Array, Array]:
     return mutual, nearest[mutual]
 
 
-def match_blocks(scan: Array, layout_level: Array, layout_to_scan: Array, seed: int) -> Correspondence | None:
-    """Feature-free fallback: the best shift of every block of the layout near a predicted place.
-
-    Args:
-        layout_to_scan: 3×3 index matrix whose shift predicts where a block lies in the scan.
-    """
-    import cv2
-
-    scan_image = fill_gaps(smooth_measured(scan, SCAN_BLUR_PX)).astype(np.float32)
-    layout_image = predicted_topography(layout_level, SCAN_BLUR_PX)
-    shift = np.rint(layout_to_scan[:2, 2]).astype(int)
-    layout_points, scan_points = [], []
-    for top in _block_starts(layout_level.shape[0]):
-        for left in _block_starts(layout_level.shape[1]):
-            block = layout_image[top : top + BLOCK_PX, left : left + BLOCK_PX]
-            x, y = left + shift[0], top + shift[1]
-            y0, x0 = max(0, y - BLOCK_SEARCH_PX), max(0, x - BLOCK_SEARCH_PX)
-            y1, x1 = max(0, y + BLOCK_PX + BLOCK_SEARCH_PX), max(0, x + BLOCK_PX + BLOCK_SEARCH_PX)
-            window = scan_image[y0:y1, x0:x1]
-            if min(window.shape) < BLOCK_PX or block.std() == 0:
-                continue
-            score = cv2.matchTemplate(window, block, cv2.TM_CCOEFF_NORMED)
-            row, column = np.unravel_index(np.argmax(score), score.shape)
-            layout_points.append((left, top))
-            scan_points.append((x0 + column, y0 + row))
-    # A block stands for its middle: at its corner a change of scale would look like a shift.
-    middle = (BLOCK_PX - 1) / 2
-    layout_middles, scan_middles = (
-        np.array(corners, float).reshape(-1, 2) + middle for corners in (layout_points, scan_points)
-    )
-    return _robust_affine("blocks", len(layout_points), layout_middles, scan_middles, seed)
-
-
 def _contrast_image(image: Array) -> Array:
     """8-bit copy with local contrast equalised; used to find keypoints, never for heights."""
     import cv2
@@ -159,33 +126,3 @@ def _contrast_image(image: Array) -> Array:
     low, high = np.percentile(image, (0.5, 99.5))
     stretched = np.clip((image - low) / max(high - low, 1e-12), 0, 1) * 255
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(stretched.astype(np.uint8))
-
-
-def _robust_affine(
-    method: str,
-    keypoints: int,
-    layout_points: Array,
-    scan_points: Array,
-    seed: int,
-) -> Correspondence | None:
-    import cv2
-
-    if len(layout_points) < 6:
-        return None
-    cv2.setRNGSeed(seed)
-    affine, inlier = cv2.estimateAffine2D(
-        layout_points, scan_points, method=cv2.USAC_MAGSAC, ransacReprojThreshold=INLIER_PX, maxIters=5000
-    )
-    if affine is None or not np.isfinite(affine).all():
-        return None
-    inlier = np.asarray(inlier).reshape(-1).astype(bool)
-    if inlier.sum() < 3 or abs(np.linalg.det(affine[:, :2])) < 1e-3:
-        return None
-    hull_px2 = float(cv2.contourArea(cv2.convexHull(layout_points[inlier].astype(np.float32))))
-    matrix = np.vstack([affine, [0.0, 0.0, 1.0]])
-    return Correspondence(method, keypoints, layout_points, scan_points, inlier, matrix, hull_px2)
-
-
-def _block_starts(size: int) -> Array:
-    count = max(1, 2 * size // BLOCK_PX - 1)
-    return np.unique(np.linspace(0, max(size - BLOCK_PX, 0), count).astype(int))

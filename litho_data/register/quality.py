@@ -17,7 +17,7 @@ class RegistrationQuality:
     reason: str  # why it failed; empty when passed
     warning: str  # what to know about a scan that passed
     model: str
-    method: str  # orb | sift | blocks | correlation: what found the coarse fit
+    method: str  # orb | correlation: what found the coarse fit
     dihedral: str  # the operation that brings the scan onto the layout
     polarity: int  # -1: the scan shows the layout's negative
     converged: bool
@@ -128,7 +128,7 @@ def judge(
         "layout looks alike in another orientation; upright assumed": tied and upright,
         f"target registration error {tre_px:.2f} px": tre_px > thresholds.tre_median_warning_px,
         "inverted contrast": figures["polarity"] == -1,
-        f"coarse fit by {figures['method']}, no feature matches": figures["method"] not in ("orb", "sift"),
+        "coarse fit by correlation, no feature matches": figures["method"] != "orb",
         "refinement did not converge": not figures["converged"],
     }
     reasons, said = ("; ".join(text for text, so in one.items() if so) for one in (failures, warnings))
