@@ -192,6 +192,10 @@ def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
     ome = root["scans/P12"].attrs["ome"]
     (image,) = ome["multiscales"]
     (dataset,) = image["datasets"]
-    assert (ome["version"], [axis["name"] for axis in image["axes"]]) == ("0.5", ["y", "x"])
+    assert ome["version"] == "0.5"
+    # OME-NGFF 0.5: axes and dimensions of the array must have the same names.
+    dimensions = root["scans/P12"][dataset["path"]].metadata.dimension_names
+    assert tuple(axis["name"] for axis in image["axes"]) == dimensions
+    assert {(axis["type"], axis["unit"]) for axis in image["axes"]} == {("space", "micrometer")}
     assert dataset["coordinateTransformations"] == [{"type": "scale", "scale": [0.1, 0.1]}]
     assert root["scans/P12"][dataset["path"]].shape == (128, 128)
