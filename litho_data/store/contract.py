@@ -151,7 +151,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
-    """The arrays over all scans by name; InputError where one is missing or of another shape, type or order."""
+    """The arrays over all scans by name; InputError where one is missing or of another shape, type, order."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -166,7 +166,7 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
         if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
-        dims = array.metadata.to_dict()["dimension_names"]
+        dims: Any = array.metadata.to_dict()["dimension_names"]
         if tuple(dims or ()) != variable.dims:
             raise InputError(f"dimensions of {variable.name} of {path}", got=dims, wanted=variable.dims)
     return arrays
