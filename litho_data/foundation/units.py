@@ -1,14 +1,16 @@
 """Units of length in files: known ones are converted, all others are refused."""
 
+import re
+
 from litho_data.foundation.errors import InputError
 
 NM_PER_UM = 1000.0
 
+_METRE = re.compile(r"met(er|re)s?$")
+_PREFIXES = {"": "", "kilo": "k", "centi": "c", "milli": "m", "micro": "u", "nano": "n", "pico": "p"}
 _IN_UM = {
     "km": 1e9,
     "m": 1e6,
-    "metre": 1e6,
-    "meter": 1e6,
     "dm": 1e5,
     "cm": 1e4,
     "mm": 1e3,
@@ -37,11 +39,18 @@ def um_per(unit: str) -> float:
         InputError: the unit is unknown or not a length. ``"A"`` is the ampere, never the ångström.
     """
     try:
-        return _IN_UM[unit.strip().translate(_SPELLINGS)]
+        return _IN_UM[_short(unit)]
     except KeyError:
         raise InputError("unit of length", got=repr(unit), wanted="m, mm, µm (um), nm, pm or Å") from None
 
 
 def is_length(unit: str) -> bool:
     """Whether ``um_per`` knows the unit."""
-    return unit.strip().translate(_SPELLINGS) in _IN_UM
+    return _short(unit) in _IN_UM
+
+
+def _short(unit: str) -> str:
+    """``nm`` for nanometres, in all spellings."""
+    plain = unit.strip().translate(_SPELLINGS)
+    prefix = _METRE.sub("", plain.lower())
+    return f"{_PREFIXES[prefix]}m" if _METRE.search(plain.lower()) and prefix in _PREFIXES else plain

@@ -24,8 +24,18 @@ _RANGE = ("valid_min", "valid_max", "valid_range")
 _UNKNOWN = re.compile(
     r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb", re.I
 )
+# The same beside an array or above it, where many other numbers stand.
+_SCALE = re.compile(
+    r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
+    r"(z|heights?|data|values?|topography|add)[ _-]?offset",
+    re.I,
+)
+_UNIT = re.compile(r"((z|heights?|data|values?)[ _-]?)?units?", re.I)
+_X = re.compile(r"(x|lon|col|fast|horizontal)(?![a-wyz])|(lon|col)", re.I)
+_Y = re.compile(r"(y|lat|row|slow|vertical|line)(?![a-xz])|(lat|row|line)", re.I)
 _UNEVEN = 1e-3
 _OF_DIMENSIONS = ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates")
+_DIMENSIONS = ("_ARRAY_DIMENSIONS", "axes")
 _NO_COORDINATE = b"This is a netCDF dimension but not"
 
 
@@ -61,25 +71,33 @@ def array_channel(
     attributes: Mapping[str, Any],
     dims: tuple[str, str] = ("", ""),
     coordinates: Mapping[str, Coordinate] | None = None,
+    around: Mapping[str, Any] | None = None,
 ) -> Channel:
     """The channel of a two-dimensional array: [y, x] unless the names of its dimensions say otherwise.
 
-    ``raw`` reads its values. Where the coordinate along y falls, the order of the file is kept all the same.
+    ``raw`` reads its values, ``around`` is what stands beside and above it. x grows to the right; where the
+    coordinate along y falls, the order of the file is kept all the same.
 
     Raises:
         InputError: attributes that change the values in a way that is not known here, with their names; no
             real numbers; coordinates at uneven steps.
     """
     says = {key: _plain(value) for key, value in attributes.items()}
+    beside = {key: _plain(value) for key, value in (around or {}).items()}
     unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value)]
+    unknown += [
+        f"{key} = {value}"
+        for key, value in beside.items()
+        if _SCALE.fullmatch(key) and isinstance(value, int | float) and value not in (0, 1)
+    ]
     if unknown:
         raise InputError(
             "values", got=", ".join(unknown), wanted="scale_factor and add_offset, or plain values"
         )
     if dtype.kind not in _NUMBERS:
         raise InputError("values", got=dtype, wanted="integers or real numbers")
-    turned = dims[0].lower().startswith("x") and not dims[1].lower().startswith("x")
-    known, (y, x) = coordinates or {}, dims[::-1] if turned else dims
+    known = coordinates or {}
+    (y, x), turned = _axes(dims, stored_shape, known)
     shape = stored_shape[::-1] if turned else stored_shape
     along = [known.get(dim, Coordinate(None, None)) for dim in (y, x)]
     extents = [one.extent(count) for one, count in zip(along, shape, strict=True)]
@@ -90,19 +108,40 @@ def array_channel(
             size_um = extents[0] * um_per(str(units[0])), extents[1] * um_per(str(units[1]))
         elif units == [None, None]:
             extent = (extents[0], extents[1])
-    unit = says.get("units", says.get("unit"))
+    x_um = along[1].values
+    mirrored = x_um is not None and len(x_um) == shape[1] and bool(x_um[0] > x_um[-1])
+    unit = next((one[key] for one in (says, beside) for key in one if _UNIT.fullmatch(key)), None)
     scaled = any(key in says for key in _APPLIED)
     return Channel(
         name=name,
         shape=shape,
         unit=str(unit) if unit not in (None, "", "1") else None,
         size_um=size_um,
-        load=partial(_values, raw, says, turned),
+        load=partial(_values, raw, says, turned, mirrored),
         full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" and not scaled else None,
         header={key: str(value) for key, value in says.items()},
         x_is=f"the {'first' if turned else 'second'} index" + (f", {x}" if x else ""),
         extent=extent,
     )
+
+
+def _axes(
+    dims: tuple[str, str], shape: Shape, known: Mapping[str, Coordinate]
+) -> tuple[tuple[str, str], bool]:
+    """The names of y and x, and whether the first index runs along x.
+
+    Dimensions without coordinates take those of their lengths that are called x and y.
+    """
+    turned = bool(
+        (_X.match(dims[0]) and not _X.match(dims[1])) or (_Y.match(dims[1]) and not _Y.match(dims[0]))
+    )
+    if not any(dim in known for dim in dims):
+        lengths = {name: len(one.values) for name, one in known.items() if one.values is not None}
+        y, x = (next((name for name in lengths if axis.match(name)), "") for axis in (_Y, _X))
+        for other in (turned, not turned):
+            if y and x and (lengths[y], lengths[x]) == (shape[::-1] if other else shape):
+                return (y, x), other
+    return (dims[1], dims[0]) if turned else dims, turned
 
 
 def _changes(key: str, value: Any) -> bool:
@@ -119,7 +158,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool) -> Loaded:
+def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mirrored: bool) -> Loaded:
     """Missing first, in the numbers of the file; then scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -127,7 +166,8 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool) -> 
     bad = (values < low) | (values > high) | np.isin(values, missing)
     values = values * float(says.get("scale_factor", 1.0)) + float(says.get("add_offset", 0.0))
     values[bad] = np.nan
-    return np.ascontiguousarray(values.T if turned else values), None
+    values = values.T if turned else values
+    return np.ascontiguousarray(values[:, :: -1 if mirrored else 1]), None
 
 
 def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Channel]]]) -> list[Channel]:
@@ -153,17 +193,42 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
     dims = [
         item.dims[k].label or (at[0].name.rsplit("/", 1)[-1] if at else "") for k, at in enumerate(scales)
     ]
+    group = item.parent
     if matlab:
         dims = ["x", "y"]
+    elif not any(dims):
+        stated = next((at[key] for at in (item.attrs, group.attrs) for key in _DIMENSIONS if key in at), "")
+        names = re.split(r"[\s,:]+", stated) if isinstance(stated := _plain(stated), str) else stated
+        dims = [_plain(name) for name in names] if len(names) == len(dims) else dims
     held = {
         dim: _coordinate(at[0][()], at[0].attrs)
         for dim, at in zip(dims, scales, strict=True)
         if at and not bytes(at[0].attrs.get("NAME", b"")).startswith(_NO_COORDINATE)
     }
+    near = {name: one for name, one in group.items() if getattr(one, "size", None)}
+    lines = {name: _coordinate(np.ravel(one[()]), one.attrs) for name, one in near.items() if _is_line(one)}
+    around = {name: one[()] for name, one in near.items() if one.size == 1}
+    while True:
+        around = {**group.attrs, **around}
+        if group.name == "/":
+            break
+        group = group.parent
     attributes = {key: value for key, value in item.attrs.items() if key not in _OF_DIMENSIONS}
     return array_channel(
-        item.name.strip("/"), item.dtype, item.shape, raw, attributes, (dims[0], dims[1]), held
+        item.name.strip("/"),
+        item.dtype,
+        item.shape,
+        raw,
+        attributes,
+        (dims[0], dims[1]),
+        held or lines,
+        around,
     )
+
+
+def _is_line(array: Any) -> bool:
+    """Whether an array holds numbers along one dimension; MATLAB's have two."""
+    return array.dtype.kind in _NUMBERS and array.size > 1 and max(array.shape) == array.size
 
 
 def _dataset(path: Path, name: str) -> Array:
@@ -195,11 +260,12 @@ def read_netcdf(path: Path) -> list[Channel]:
             if one.dimensions == (name,)
         }
         arrays = {name: one for name, one in file.variables.items() if len(one.shape) == 2}
+        around = dict(file._attributes)
         return _channels(
             path,
             "NetCDF",
             (
-                (name, partial(_in_memory, name, one[:], one._attributes, one.dimensions, held))
+                (name, partial(_in_memory, name, one[:], one._attributes, one.dimensions, held, around))
                 for name, one in arrays.items()
                 if min(one.shape) > 1
             ),
@@ -223,8 +289,12 @@ def read_matlab(path: Path) -> list[Channel]:
     with foreign_parser(path, "MATLAB"):
         held = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
     maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
+    lines = {name: Coordinate(one.ravel().astype(float), None) for name, one in held.items() if _is_line(one)}
+    around = {name: one.ravel()[0] for name, one in held.items() if one.size == 1}
     named = (
-        (name, partial(_in_memory, name, one, {})) for name, one in maps.items() if one.dtype.kind in "uifc"
+        (name, partial(_in_memory, name, one, {}, ("", ""), lines, around))
+        for name, one in maps.items()
+        if one.dtype.kind in "uifc"
     )
     return _channels(path, "MATLAB", named)
 

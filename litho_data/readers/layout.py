@@ -1,29 +1,26 @@
 """Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.kinds import Array
+from litho_data.readers.exported import export_of, exported_levels
 from litho_data.readers.npy import load_array
 from litho_data.readers.registry import PICTURE, detect_format, require_file
-from litho_data.readers.tiff import open_tiff, single_sample
+from litho_data.readers.tiff import open_tiff, require_upright, single_sample
 
 _LARGEST_LEVEL = 255
 _WHITE = (255, 65535)
-# Of the files that the design package writes for a printer.
-_EXPORT = "litho-design/export/1"
 
 
 def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels: int | None = None) -> Array:
     """Levels of a layout, uint8 (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
-    grey if its colours are identical. A file exported by the design package is read by the sidecar beside it.
+    grey if its colours are identical. A file that the design package exported, of any of its formats, is read
+    by the sidecar beside it.
 
     Args:
         path: the file.
@@ -36,17 +33,18 @@ def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels
             no steps of grey, a sidecar of another file.
     """
     file = require_file(path)
+    if says := export_of(file):
+        return exported_levels(file, says)
     kind = detect_format(file)
     readers = {"tiff": _tiff_pixels, "npy": load_array, PICTURE: _image_pixels}
     if kind not in readers:
         raise InputError(f"layout {file}: format", got=kind, wanted="TIFF, PNG, BMP or NPY")
-    sidecar = _sidecar(file)
     pixels = single_sample(file, np.asarray(readers[kind](file)))
     if pixels.size == 0:
         raise InputError(f"layout {file}: shape", got=pixels.shape, wanted="at least one pixel")
     if pixels.dtype.kind not in "uif" or not np.isfinite(pixels).all():
         raise InputError(f"layout {file}: values", got=_range(pixels), wanted="integer levels from 0 to 255")
-    step = grey_per_level or sidecar.get("grey_per_level") or _white_step(pixels, levels)
+    step = grey_per_level or _white_step(pixels, levels)
     found = np.rint(pixels / step)
     if (
         np.abs(pixels - found * step).max() > 0.5 * (step > 1)
@@ -54,9 +52,6 @@ def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels
     ):
         wanted = "integer levels from 0 to 255" if step == 1 else f"steps of {step:g} per level"
         raise InputError(f"layout {file}: values", got=_range(pixels), wanted=wanted)
-    if marks := sidecar.get("marks"):
-        top, bottom, left, right = marks["element_px"]
-        found = found[top:bottom, left:right]
     return found.astype(np.uint8)
 
 
@@ -71,28 +66,11 @@ def _white_step(pixels: Array, levels: int | None) -> float:
     return 1.0
 
 
-def _sidecar(file: Path) -> dict[str, Any]:
-    """What the design package wrote about an exported file; empty for others.
-
-    Raises:
-        InputError: the sidecar is that of another file.
-    """
-    path = file.with_name(f"{file.name}.json")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    if not isinstance(content, dict) or content.get("schema") != _EXPORT:
-        return {}
-    if content.get("file_sha256") != file_sha256(file):
-        raise InputError(f"layout {file}", got="another file than its sidecar says", wanted=str(path))
-    return content
-
-
 def _tiff_pixels(path: Path) -> Array:
     with open_tiff(path) as file:
-        if len(file.pages) != 1 and not _sidecar(path):
+        if len(file.pages) != 1:
             raise InputError(f"layout {path}: pages", got=len(file.pages), wanted="one image")
+        require_upright(path, file.pages.first)
         return file.pages.first.asarray()
 
 

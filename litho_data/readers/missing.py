@@ -16,8 +16,8 @@ _USUAL = np.array([
     -2147483648, -1e30, -1e37, -1e38, -1e100, -1.7976931e308,
 ])  # fmt: skip
 _USUAL_TOLERANCE = 1e-4
-# A number that no program is known for must stand this many spans of the other values away.
-_FAR = 100
+# A number that no program is known for must stand this many spans of the other values away; one pixel, more.
+_FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
 # Values are held as float32, and the largest of all written with a few digits.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
@@ -68,7 +68,7 @@ def _marks(values: Array) -> list[tuple[float, int]]:
         end = 0 if gaps[0] * max(spans[1], 1e-300) > gaps[1] * max(spans[0], 1e-300) else -1
         value, count, gap, span = float(numbers[end]), int(counts[end]), float(gaps[end]), float(spans[end])
         usual = np.isclose(value, _USUAL, rtol=_USUAL_TOLERANCE, atol=0).any()
-        if not (usual and gap > span) and not (count > 1 and gap > _FAR * span):
+        if not (usual and gap > span) and not gap > (_FAR if count > 1 else _FAR_ALONE) * span:
             break
         found.append((value, count))
         numbers, counts = (numbers[1:], counts[1:]) if end == 0 else (numbers[:-1], counts[:-1])

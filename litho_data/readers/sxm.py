@@ -1,4 +1,4 @@
-"""Nanonis SXM: a text header in sections, then big-endian float32 images, two directions per channel."""
+"""Nanonis SXM: a text header in sections, then float32 images, two directions per channel."""
 
 import re
 from functools import partial
@@ -14,7 +14,7 @@ _MAGIC = b":NANONIS_VERSION:"
 _END, _DATA = b":SCANIT_END:", b"\x1a\x04"
 _SECTION = re.compile(r"^:([^:\n]*(?::[^:\n]+)*):[ \t]*$", re.MULTILINE)
 _FORWARD, _BACKWARD = ("forward", "fwd"), ("backward", "bwd")
-_ITEM = 4
+_ITEM, _ORDERS = 4, {"MSBFIRST": ">f4", "LSBFIRST": "<f4"}
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -40,7 +40,8 @@ def read_channels(path: Path) -> list[Channel]:
     except (KeyError, ValueError, IndexError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: header of a Nanonis scan", got=got, hint=DAMAGED) from error
-    if header.get("SCANIT_TYPE", "FLOAT").split()[0] != "FLOAT":
+    kind, order = (*header.get("SCANIT_TYPE", "FLOAT").split(), "MSBFIRST")[:2]
+    if kind != "FLOAT" or order not in _ORDERS:
         raise InputError(f"{path} (sxm): SCANIT_TYPE", got=header["SCANIT_TYPE"], wanted="FLOAT")
     wanted = len(images) * ny * nx * _ITEM
     if end < 0 or start < end or len(raw) - start < wanted:
@@ -52,7 +53,9 @@ def read_channels(path: Path) -> list[Channel]:
             shape=(ny, nx),
             unit=unit,
             size_um=extent_um(y_m, x_m, "m"),
-            load=partial(_load, path, start + k * ny * nx * _ITEM, (ny, nx), upward, way in _BACKWARD),
+            load=partial(
+                _load, path, _ORDERS[order], start + k * ny * nx * _ITEM, (ny, nx), upward, way in _BACKWARD
+            ),
             fast_axis="x",
             header=header,
         )
@@ -69,8 +72,8 @@ def _ways(direction: str) -> tuple[str, ...]:
     return (direction,)
 
 
-def _load(path: Path, start: int, shape: Shape, upward: bool, backward: bool) -> Loaded:
-    values = np.fromfile(path, ">f4", shape[0] * shape[1], offset=start).reshape(shape).astype(float)
+def _load(path: Path, kind: str, start: int, shape: Shape, upward: bool, backward: bool) -> Loaded:
+    values = np.fromfile(path, kind, shape[0] * shape[1], offset=start).reshape(shape).astype(float)
     return np.ascontiguousarray(values[:: -1 if upward else 1, :: -1 if backward else 1]), None
 
 

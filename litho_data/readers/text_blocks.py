@@ -18,17 +18,33 @@ _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
 # A semicolon may also stand before the first cell of a row.
-_COMMENT = ("#", "%")
+# A spreadsheet's errors begin like one.
+_COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _LOOKED_AT = 400
-_FEWEST_ODD_NULS = 0.8
+_FEWEST_NULS = 0.8
+# As many equal words in a line are a row in which nothing was measured.
+_FEWEST_EQUAL = 4
+_CELLS = re.compile(r"\t|;|,")
+_QUOTED = re.compile(r'"([^",\n]*)"')
 # The words of other programs, in the languages of their users.
 _WIDTHS = ("width", "breite", "largeur", "larghezza", "ancho", "anchura", "šířka", "x-length", "x range")
 _HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška", "y-length", "y range")
 _CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channel name")
 _UNITS = ("value units", "value unit", "einheiten", "unités", "unità valore", "unidades de valor",
-          "jednotky hodnot", "z-unit", "z unit", "zunit", "z units", "data unit")  # fmt: skip
+          "jednotky hodnot", "z-unit", "z unit", "zunit", "z units", "data unit", "data units", "height unit",
+          "height units", "unit", "units", "einheit", "единицы измерения", "値の単位", "값 단위")  # fmt: skip
+# The unit of a column or of all numbers, as in "Height [nm]"; before a number it is that of a length.
+_TITLED = re.compile(
+    r"\b(?:z|heights?|topography|höhe|hauteur|altura|altezza)\b\s*(?>(?:in\s+|[\[(]\s*)([^\])\s:=]{1,12})[\])]?)"
+    r"(?!\s*[:=\t;,]\s*[-\d])",
+    re.IGNORECASE,
+)
+_PIXELS = (
+    ("nrows", "rows", "y-pixels", "yres", "ny", "vertical"),
+    ("ncols", "cols", "columns", "x-pixels", "xres", "nx", "horizontal"),
+)
 _MISSING = (
     "nodata_value",
     "nodata value",
@@ -40,7 +56,8 @@ _MISSING = (
 )
 _TO_METRES = "height conversion factor (-> m)"
 _SCALES = re.compile(
-    r"bit2nm|scale_?factor|(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
+    r"bit2nm|(scale|conversion|calibration)[ _-]?factor|^(multiplier|scale|factor|lsb)\b|"
+    r"(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
 )
 
 
@@ -66,7 +83,21 @@ class Block:
     @property
     def unit(self) -> str | None:
         """Of the values; None if the header states none."""
-        return "m" if self.factor is not None else self.first(_UNITS) or None
+        if self.factor is not None:
+            return "m"
+        titled = [unit for text in self.words for unit in _TITLED.findall(text[:200]) if is_length(unit)]
+        return self.first(_UNITS).strip("[]() ") or next(iter(titled), None)
+
+    def require_pixels(self, shape: Shape) -> None:
+        """Compare the numbers of rows and columns with what the header states.
+
+        Raises:
+            InputError: it states others.
+        """
+        for count, names, what in zip(shape, _PIXELS, ("rows", "columns"), strict=True):
+            stated = self.first(names)
+            if stated.isdecimal() and int(stated) != count:
+                raise InputError(f"number of {what}", got=count, wanted=f"{stated} as in the header")
 
     @property
     def factor(self) -> float | None:
@@ -91,7 +122,7 @@ class Block:
 
     def size_um(self, shape: Shape) -> YX | None:
         """From the two sides, or from the size of a pixel."""
-        if pitch := _length_um(self.first(("pixel size",))):
+        if pitch := _length_um(self.first(("pixel size", "xycalibration", "xy calibration"))):
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(names)) for names in (_HEIGHTS, _WIDTHS)]
         return (sides[0], sides[1]) if sides[0] and sides[1] else None
@@ -104,25 +135,29 @@ def read_text(path: Path) -> str:
         InputError: UTF-16 with a part of a character, or bytes that are no text; the message names the line.
     """
     raw = path.read_bytes()
-    odd = raw[:_LOOKED_AT][1::2]
+    halves = {"utf-16-be": raw[:_LOOKED_AT:2], "utf-16-le": raw[1:_LOOKED_AT:2]}
     if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         code = "utf-16"
-    elif odd and odd.count(0) > _FEWEST_ODD_NULS * len(odd):
-        code = "utf-16-le"
     else:
-        code = "utf-8-sig"
+        full = (code for code, half in halves.items() if half.count(0) > _FEWEST_NULS * len(half))
+        code = next(full, "utf-8-sig")
     try:
         text = raw.decode(code)
     except UnicodeDecodeError as error:
         if code != "utf-8-sig":
             raise InputError(f"cannot read {path} as UTF-16", got=error.reason, hint=DAMAGED) from error
         text = raw.decode("latin-1")
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    text = without_quotes(text.replace("\r\n", "\n").replace("\r", "\n"))
     if strange := _STRANGE.search(text):
         line = text.count("\n", 0, strange.start()) + 1
         got = f"byte 0x{ord(strange[0]):02x}"
         raise InputError(f"{path} line {line}", got=got, wanted="a text of numbers")
     return text
+
+
+def without_quotes(text: str) -> str:
+    """The text with quotes only where a cell holds a comma."""
+    return _QUOTED.sub(r"\1", text)
 
 
 def blocks_of(text: str) -> list[Block]:
@@ -141,7 +176,7 @@ def blocks_of(text: str) -> list[Block]:
 
 
 def _blocks(text: str) -> Iterator[Block]:
-    block, comments = Block({}, [], 0), 0
+    block = Block({}, [], 0)
     for number_of_line, line in enumerate(text.split("\n"), start=1):
         numbers = is_row(line)
         if block.rows and not numbers:
@@ -151,23 +186,39 @@ def _blocks(text: str) -> Iterator[Block]:
             block.first_line = block.first_line or number_of_line
             block.rows.append(line)
         elif line.strip():
-            comments += 1
             block.words.append(line.strip())
             _note(line, block.header, number_of_line)
     if block.rows:
         yield block
 
 
+def header_of(text: str) -> Block:
+    """What lines of words say, without numbers below them."""
+    block = Block({}, [], 0)
+    for number_of_line, line in enumerate(text.splitlines(), start=1):
+        block.words.append(line.strip())
+        _note(line, block.header, number_of_line)
+    return block
+
+
 def is_row(line: str) -> bool:
-    """Whether a line is one of numbers: no comment, and at least half of its cells are."""
-    if line.startswith(_COMMENT) or not line.strip():
+    """Whether a line is one of numbers: no comment, and at least half of its cells are.
+
+    A line of one word again and again, which is no unit, is a row of missing pixels.
+    """
+    if _COMMENT.match(line) or not line.strip():
         return False
     cells = cells_of(line[:_LOOKED_AT])
     if len(line) > _LOOKED_AT and len(cells) > 1:
         cells = cells[:-1]
-    numbers = [NUMBER.fullmatch(cell) is not None for cell in cells]
-    # `ncols 32` is a word and its value.
-    return 2 * sum(numbers) >= len(cells) and (len(cells) != 2 or NUMBER.match(cells[0]) is not None)
+    words = [cell for cell in cells if NUMBER.fullmatch(cell) is None]
+    if len(cells) >= _FEWEST_EQUAL and len(set(words)) == 1 and not is_length(words[0].strip("[]()")):
+        return True
+    # `ncols 32` is a word and its value, and so is `Width: 6,4 µm`.
+    starts = NUMBER.match(cells[0]) is not None
+    return 2 * len(words) <= len(cells) and (
+        starts or (len(cells) != 2 and not _ASSIGNMENT.search(" ".join(cells[:2])))
+    )
 
 
 def cells_of(line: str) -> list[str]:
@@ -176,12 +227,14 @@ def cells_of(line: str) -> list[str]:
 
 
 def _note(line: str, header: dict[str, str], number_of_line: int) -> None:
-    text = line.strip("#%; \t\n")
-    sign = _ASSIGNMENT.search(text)
+    text = line.strip("#%; \t\n,")
+    sign = _ASSIGNMENT.search(text) or _CELLS.search(text)
     key = text[: sign.start()].strip() if sign else ""
     plain = text.split(None, 1)
     if sign and _KEY.fullmatch(key):
-        header[key] = text[sign.end() :].strip()
+        header[key] = (
+            _CELLS.sub(" ", text[sign.end() :]).strip() if sign[0] in "\t;," else text[sign.end() :].strip()
+        )
     elif len(plain) == 2 and len(text) < _LOOKED_AT and NUMBER.fullmatch(plain[1]):
         header[plain[0]] = plain[1]
     elif text:

@@ -20,17 +20,20 @@ _COLUMN = re.compile(
     r"\b([xyz])\b[^\[(xyz]{0,20}[\[(]\s*([^\])\s]{1,12})\s*[\])]|\b([xyz])\s+in\s+(\S{1,12})", re.IGNORECASE
 )
 
+_IN_UNIT = re.compile(r"\s*[\[(][^\])]*[\])]|\s+in\s+\S+")
+_GAPS = re.compile(r"\s*[,;\t]\s*|\s+")
+_AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
+
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 on top, and what the table said of lengths; ``extent`` has no unit.
+    """Heights with row 0 on top, x to the right, and what the table said of lengths; ``extent`` has no unit.
 
     ``corner``: whether the first cell was that of axes."""
 
     values: Array
     extent: YX | None = None
     size_um: YX | None = None
-    unit: str | None = None
     x_is: str = "a row of the file"
     corner: bool = False
     notes: tuple[str, ...] = ()
@@ -50,17 +53,16 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
         return Map(values)
     row, column = values[0, 1:], values[1:, 0]
     x, y = _spacing(row), _spacing(column)
-    has_x = x is not None and x > 0 and not _goes_on(body[0], x)
+    has_x = x is not None and not _goes_on(body[0], x)
     has_y = y is not None and not _goes_on(body[:, 0], y)
     if has_x and has_y:
-        extent = (abs(y or 0.0) * body.shape[0], (x or 0.0) * body.shape[1])
+        extent = (abs(y or 0.0) * body.shape[0], abs(x or 0.0) * body.shape[1])
         if _counts(row) and _counts(column):
             return Map(body, corner=True)
-        size_um, unit = _units(words, extent)
-        return Map(body, extent, size_um, unit, corner=True)
+        return Map(body if x and x > 0 else body[:, ::-1], extent, _size_um(words, extent), corner=True)
     if has_y and len(column) >= _FEWEST_ALONE:
         return Map(values[:, 1:], notes=("its first column, evenly spaced, was taken for an axis",))
-    if has_x and len(row) >= _FEWEST_ALONE:
+    if has_x and x and x > 0 and len(row) >= _FEWEST_ALONE:
         return Map(values[1:], corner=True, notes=("its first row, evenly spaced, was taken for an axis",))
     pairs = ((row, body[0]), (column, body[:, 0]))
     if all(len(line) >= _FEWEST_ALONE and _rises(line) and not _rises(beside) for line, beside in pairs):
@@ -91,21 +93,35 @@ def _counts(line: Array) -> bool:
     return bool(line[0] in (0, 1) and (np.diff(line) == 1).all())
 
 
-def _units(words: Sequence[str], extent: YX) -> tuple[YX | None, str | None]:
-    """(y, x) in µm, and the unit of z, where the words above the numbers give units for x, y and z."""
+def _size_um(words: Sequence[str], extent: YX) -> YX | None:
+    """(y, x) in µm, where the words above the numbers give units for x and y."""
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
     if "x" not in units:
-        return None, units.get("z")
-    return (extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])), units.get("z")
+        return None
+    return extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])
+
+
+def _columns(words: Sequence[str], count: int) -> list[int]:
+    """The columns of x, y and z, by the words above them; the only three if these do not say, else none."""
+    for text in words:
+        names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))
+        axes = [found[0] or "z" if (found := _AXIS.match(name)) else "" for name in names]
+        if len(axes) == count and all(axes.count(axis) == 1 for axis in "xyz"):
+            return [axes.index(axis) for axis in "xyz"]
+    return [0, 1, 2] if count == len("xyz") else []
 
 
 def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
-    """The map of points (x, y, z) that fill a regular grid; None if they do not.
+    """The map of points that fill a regular grid; None if they do not.
 
-    The rows are in the order in which the file has them, x grows to the right. Grid points that the file does
-    not have are missing pixels.
+    Their columns are x, y, z unless words say otherwise. The rows are in the order in which the
+    file has them, x grows to the right. Grid points that the file does not have are missing pixels.
     """
+    columns = _columns(words, points.shape[1])
+    if not columns:
+        return None
+    points = points[:, columns]
     x, column = np.unique(points[:, 0], return_inverse=True)
     y, row = np.unique(points[:, 1], return_inverse=True)
     step_x, step_y = _spacing(x), _spacing(y)
@@ -118,6 +134,9 @@ def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     values = np.full((len(y), len(x)), np.nan)
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
+    size_um = _size_um(words, extent)
     note = f"points of a grid, the rows as in the file: y {'grows' if down else 'falls'} downwards"
-    size_um, unit = _units(words, extent)
-    return Map(values, extent, size_um, unit, x_is="the first column of points", notes=(note,))
+    counted = _counts(x) and _counts(y)
+    return Map(
+        values, None if counted else extent, size_um, x_is=f"column {columns[0] + 1} of points", notes=(note,)
+    )

@@ -9,13 +9,14 @@ import numpy as np
 from litho_data.foundation.errors import InputError, about
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
-from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text
+from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text, without_quotes
 from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# A row of two or three numbers in a long table is a point, not a line of a map.
-_POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = 3, 3
+# Few numbers in a row of a long table are a point, not a line of a map.
+_POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
+_IGOR = "IGOR\n"
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -29,6 +30,10 @@ def read_channels(path: Path) -> list[Channel]:
             last number that was cut off; the message names the line.
     """
     text = read_text(path)
+    if text.startswith(_IGOR):
+        raise InputError(
+            f"{path}: format", got="an Igor text wave, whose rows run along x", wanted="an IBW file"
+        )
     blocks = blocks_of(text)
     if not blocks:
         raise InputError(f"{path} holds no numbers", wanted="one line per row of the height map")
@@ -46,6 +51,7 @@ def _channel(path: Path, name: str, block: Block) -> Channel:
     table = numbers_of(path, block)
     with about(str(path)):
         found, factor = _map_of(block, table), block.factor
+        block.require_pixels(found.values.shape)
     values = found.values
     for number in block.missing:
         values = np.where(np.isclose(values, number, rtol=1e-6, atol=0), np.nan, values)
@@ -56,7 +62,7 @@ def _channel(path: Path, name: str, block: Block) -> Channel:
     return Channel(
         name=name,
         shape=shape,
-        unit=block.unit if block.unit is not None else found.unit,
+        unit=block.unit,
         size_um=block.size_um(shape) or found.size_um,
         load=in_memory(values if factor is None else values * factor),
         header=block.header,
@@ -69,13 +75,13 @@ def _channel(path: Path, name: str, block: Block) -> Channel:
 
 def _map_of(block: Block, table: Table) -> Map:
     if _may_be_points(table.values.shape):
-        found = map_of_points(table.values, block.words) if table.values.shape[1] == _POINT_COLUMNS else None
-        return found or Map(table.values)
+        return map_of_points(table.values, block.words) or Map(table.values)
     return without_axes(table.values, block.words)
 
 
 def _may_be_points(shape: Shape) -> bool:
-    return shape[1] <= _POINT_COLUMNS and shape[0] >= _POINT_ROWS_PER_COLUMN * shape[1]
+    pairs = zip(_POINT_COLUMNS, _POINT_ROWS_PER_COLUMN, strict=True)
+    return any(shape[1] <= most and shape[0] >= rows * shape[1] for most, rows in pairs)
 
 
 def write_text_matrix(path: str | Path, height_um: Array) -> None:
@@ -117,9 +123,9 @@ def _refuse_points(path: Path) -> None:
     for block in blocks_of(read_text(path)):
         table = numbers_of(path, block)
         columns = table.values.shape[1]
-        if _may_be_points(table.values.shape) and (columns < 3 or map_of_points(table.values, []) is None):
+        if _may_be_points(table.values.shape) and map_of_points(table.values, block.words) is None:
             raise InputError(
-                f"{path} holds {'a profile' if columns == 2 else 'a point cloud'}",
+                f"{path} holds {'a profile' if columns == 2 else 'a point cloud or profiles'}",
                 got=f"{columns} numbers in a row, the first {' '.join(cells_of(block.rows[0]))}",
                 wanted="a height map, or the points of a whole regular grid",
             )
@@ -130,9 +136,9 @@ def _start_of_text(head: bytes) -> str:
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return head[: len(head) // 2 * 2].decode("utf-16", errors="ignore")
     if b"\0" in head:
-        halves = head[::2], head[1::2]
-        return "" if b"\0" in halves[0] else halves[0].decode("latin-1")
-    return head.decode("utf-8-sig", errors="replace")
+        halves = [half for half in (head[::2], head[1::2]) if b"\0" not in half]
+        return halves[0].decode("latin-1") if halves else ""
+    return without_quotes(head.decode("utf-8-sig", errors="replace"))
 
 
 READER = Reader("text-matrix", _recognises, read_channels)

@@ -16,6 +16,7 @@ _EXPONENT = re.compile(r"[eE][+-]?\d+$")
 _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")
 _AROUND_COMMA = re.compile(r"(?<![ \t])[ \t]*,[ \t]*(?=[^\s,]|\n|$)")
 _OTHER_SEPARATOR = re.compile(r"[^\s;,][;\t ]+[^\s;,]")
+_AT_COMMA, _WHOLE = re.compile(r"(\d*),(\d*)"), re.compile(r"(?<![\d,])\d+(?![\d,])")
 _SHOWN_CHARACTERS, _SHOWN_ROWS = 40, 2
 _TRUNCATED = "the file may be truncated"
 
@@ -65,9 +66,16 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
     decimal point in the file.
 
     Raises:
-        InputError: cells apart by commas and by something else, as in ``1,234.5;2,345.6``.
+        InputError: cells apart by commas and by something else, as in ``1,234.5;2,345.6``; commas that may be
+            decimal ones between cells apart by commas, or marks of thousands.
     """
-    text = text.replace("\x0c", " ")
+    rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
+    for mark in "\t;,":  # at the ends of all rows it is apart from nothing
+        if all(row.endswith(mark) for row in rows if row):
+            rows = [row[:-1] for row in rows]
+        if all(row.startswith(mark) for row in rows if row):
+            rows = [row[1:] for row in rows]
+    text = "\n".join(rows)
     if "d" in text or "D" in text:
         text = _FORTRAN_EXPONENT.sub("e", text)
     separator = ";" if ";" in text else None
@@ -75,6 +83,7 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
         tight = _AROUND_COMMA.sub(",", text)
         if not _OTHER_SEPARATOR.search(tight):
             separator = ","
+            _refuse_decimal_commas(path, tight, first_line)
         elif "." in tight or tight != text:
             for line, row in enumerate(tight.split("\n"), start=first_line):
                 if "," in row and _OTHER_SEPARATOR.search(row.strip()):
@@ -82,13 +91,34 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
                     wanted = "cells apart by one separator, and no marks of thousands"
                     raise InputError(f"{path} line {line}", got=got, wanted=wanted)
         else:
+            parts = _AT_COMMA.findall(text)
+            if (
+                all(before not in ("", "0") and len(after) == 3 for before, after in parts)
+                and "e" not in text.lower()
+                and _WHOLE.search(text)
+            ):
+                raise InputError(
+                    f"{path} line {first_line}",
+                    got="commas before three digits",
+                    wanted="no marks of thousands",
+                )
             text = text.replace(",", ".")
     if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):
         separator = "\t"
-    rows = [row.rstrip(" ") for row in text.split("\n")]
-    if separator is not None and all(row.endswith(separator) for row in rows if row):
-        text = "\n".join(row[:-1] for row in rows)
     return text, separator
+
+
+def _refuse_decimal_commas(path: Path, text: str, first_line: int) -> None:
+    """In ``0,9000,0,3100`` every second cell has the same number of digits, and no other cell has."""
+    if "." in text:
+        return
+    rows = [row.split(",") for row in text.split("\n") if row]
+    every, other = ({len(cell) for row in rows for cell in row[start::2]} for start in (1, 0))
+    if len(every) == 1 and every.isdisjoint(other) and all(len(row) % 2 == 0 for row in rows):
+        got = repr(",".join(rows[0])[:_SHOWN_CHARACTERS])
+        raise InputError(
+            f"{path} line {first_line}", got=got, wanted="decimal commas or commas between cells"
+        )
 
 
 def _cell_by_cell(path: Path, text: str, separator: str | None, first_line: int) -> Table:

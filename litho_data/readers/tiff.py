@@ -17,12 +17,14 @@ from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
+from litho_data.readers.text_blocks import header_of
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
+_ORIENTATION, _UPRIGHT = 274, 1
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
 # Makers keep heights beside a picture in tags of their own.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
@@ -30,6 +32,7 @@ _LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
 _GDAL_METADATA, _GDAL_NODATA = 42112, 42113
 _STRAIGHT_LINE = 0
+_XML, _LOOKED_AT = "<", 200
 _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "inch"}
 
 
@@ -64,6 +67,19 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
         yield file
 
 
+def require_upright(path: Path, page: Any) -> None:
+    """Refuse a page that its file says to be stored turned or mirrored: programs differ in what they show.
+
+    Raises:
+        InputError: so it says.
+    """
+    stated = page.tags.valueof(_ORIENTATION, _UPRIGHT)
+    if stated != _UPRIGHT:
+        raise InputError(
+            f"{path}: Orientation of the page", got=int(stated), wanted="1, the first row on top"
+        )
+
+
 def maker_of(path: Path) -> str:
     """SurfaceTopography's name of the format whose maker signs this TIFF; empty if none does."""
     try:
@@ -82,6 +98,7 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: 
     if page.ndim not in (2, 3) or (page.ndim == 3 and page.shape[-1] != samples):
         raise InputError(f"{what}: shape", got=page.shape, wanted="a two-dimensional image")
     shape = (int(page.shape[0]), int(page.shape[1]))
+    require_upright(path, page)
     dtype = np.dtype(page.dtype)
     if dtype.kind not in "uif":
         raise InputError(f"{what}: type of the values", got=dtype, wanted="integers or real numbers")
@@ -119,9 +136,13 @@ def _calibration(
     """Scale, offset, unit and no-data value of a page.
 
     Raises:
-        InputError: a calibration of ImageJ that is no straight line.
+        InputError: a calibration of ImageJ that is no straight line, a scale in the description that is not
+            known.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
+    if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
+        header = header_of(str(page.description))
+        scale, unit = header.factor or 1.0, header.unit
     if "c0" in imagej or "c1" in imagej or int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE:
         if int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE or "c2" in imagej:
             stated = ", ".join(f"{key} = {imagej[key]}" for key in ("cf", "c0", "c1", "c2") if key in imagej)

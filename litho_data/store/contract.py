@@ -8,7 +8,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -36,6 +36,7 @@ from litho_data.store.schema import (
     WRITE,
     Surround,
 )
+from litho_data.store.write import pixel_centres_um
 
 if TYPE_CHECKING:
     import zarr
@@ -150,7 +151,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
-    """The arrays over all scans by name; InputError where one is missing or of another shape or type."""
+    """The arrays over all scans by name; InputError where one is missing or of another shape, type, order."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -165,7 +166,27 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
         if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
+        dims: Any = array.metadata.to_dict()["dimension_names"]
+        if tuple(dims or ()) != variable.dims:
+            raise InputError(f"dimensions of {variable.name} of {path}", got=dims, wanted=variable.dims)
     return arrays
+
+
+def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
+    """Refuse a copy whose pixels are not those of the layouts, by the coordinates that it carries.
+
+    What the store says of places, such as the transforms of the scans, is told from the first pixel.
+
+    Raises:
+        InputError: rows or columns were left out or turned round.
+    """
+    for name, count in zip(("y_um", "x_um"), shape, strict=True):
+        if has_child(root, name):
+            found, wanted = values_of(root, name), pixel_centres_um(count, pitch_um)
+            if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-6, atol=0):
+                got, shown = (f"{', '.join(f'{one:g}' for one in line[:3])}, …" for line in (found, wanted))
+                hint = "a copy may hold fewer scans, and fewer of the last rows and columns"
+                raise InputError(f"{name} of {path}", got=got, wanted=shown, hint=hint)
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:

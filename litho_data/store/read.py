@@ -29,6 +29,7 @@ from litho_data.store.contract import (
     checked_columns,
     require_complete,
     require_manifest,
+    require_own_pixels,
     require_possible,
     true_shapes,
 )
@@ -80,6 +81,7 @@ class Store:
         self.levels: int = attributes["levels"]
         self.write: dict[str, Any] | None = attributes["write"]
         self._arrays = checked_arrays(root, path)
+        require_own_pixels(root, path, self._arrays["mask_level"].shape[1:], self.pitch_um)
         self._columns = checked_columns(root, path)
         self.ids: list[str] = self._columns["scan"]
         self._print_ids: list[str] = self._columns["print"]

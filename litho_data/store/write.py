@@ -58,8 +58,8 @@ def write_scan_group(
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
-    """OME-NGFF 0.5: one image of heights with its pixel size; lengths along y and x in micrometres."""
-    axes = [{"name": axis, "type": "space", "unit": "micrometer"} for axis in "yx"]
+    """OME-NGFF 0.5: one image of heights, its pixel size, and axes named as the dimensions of the array."""
+    axes = [{"name": _OWN_FRAME[axis], "type": "space", "unit": "micrometer"} for axis in "yx"]
     scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
     dataset = {"path": path, "coordinateTransformations": scale}
     return {"version": "0.5", "multiscales": [{"name": name, "axes": axes, "datasets": [dataset]}]}

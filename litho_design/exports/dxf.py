@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,31 +37,3 @@ def write_dxf(path: Path, levels: LevelRows, pitch_um: float, greys: Sequence[in
                 count += 1
         stream.write("0\nENDSEC\n0\nEOF\n")
     return count
-
-
-def read_dxf_levels(path: Path, shape: tuple[int, int], pitch_um: float, greys: Sequence[int]) -> np.ndarray:
-    """Levels uint8 (ny, nx), row 0 on top, from the polylines of ``write_dxf``."""
-    level_of = {grey: level for level, grey in enumerate(greys)}
-    found = np.full(shape, level_of.get(0, 0), np.uint8)
-    layer, x, corners = 0, 0.0, []
-    for code, value in _pairs(path):
-        if code == "8":
-            layer = int(value)
-        elif code == "10":
-            x = float(value)
-        elif code == "20":
-            corners.append((x / pitch_um, shape[0] - float(value) / pitch_um))
-        elif value == "POLYLINE":
-            corners = []
-        elif value == "SEQEND":
-            (left, top), (right, bottom) = (
-                np.rint(edge(corners[1:], axis=0)).astype(int) for edge in (np.min, np.max)
-            )
-            found[top:bottom, left:right] = level_of[layer]
-    return found
-
-
-def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    with open(path, encoding="ascii") as stream:
-        for code in stream:
-            yield code.strip(), next(stream).strip()

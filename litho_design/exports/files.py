@@ -14,22 +14,21 @@ from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.readers.exported import exported_levels, exported_rows
 from litho_design.elements.element import Element
-from litho_design.exports.dxf import read_dxf_levels, write_dxf
-from litho_design.exports.gds import GdsLayers, GdsRows, write_gds
-from litho_design.exports.gwl import Gwl, read_gwl_levels, write_gwl
+from litho_design.exports.dxf import write_dxf
+from litho_design.exports.gds import GdsLayers, write_gds
+from litho_design.exports.gwl import Gwl, write_gwl
 from litho_design.exports.image import (
-    TiffRows,
     linear_greys,
     measured_greys,
-    read_image_levels,
     write_image,
     write_tiff,
 )
 from litho_design.exports.marks import Marks, with_marks
 from litho_design.exports.rows import LevelRows, bands_of, layout_rows
 from litho_design.exports.sidecar import Format, Sidecar, of_design, of_layout, read_sidecar, sidecar_path
-from litho_design.exports.stl import read_stl_levels, write_stl
+from litho_design.exports.stl import write_stl
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.layout import LayoutSettings
 from litho_design.tasks.design import Design
@@ -147,7 +146,7 @@ def export(
         _write(file, Sidecar(file_sha256="", **sidecar), written)
         record = Sidecar(file_sha256=file_sha256(file), **sidecar)
         record.write(temporary).rename(sidecar_path(file))
-        back = _rows(file, record)
+        back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], written[rows]) for rows in bands_of(written, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
         # The sidecar last: without it, or with an older one, the file is refused.
@@ -164,11 +163,7 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
     """
     path = Path(file)
     sidecar = read_sidecar(path)
-    levels = _rows(path, sidecar)[:]
-    if sidecar.marks is not None:
-        top, bottom, left, right = sidecar.marks.element_px
-        levels = levels[top:bottom, left:right].copy()
-    return levels, sidecar
+    return exported_levels(path, sidecar.model_dump()), sidecar
 
 
 def _source(given: Any, pitch_um: float, level_height_um: float) -> _Source:
@@ -230,25 +225,3 @@ def _write(file: Path, job: Sidecar, levels: LevelRows) -> None:
             write_dxf(file, levels, pitch_um, job.greys)
         else:
             write_image(file, levels[:], job.greys, step_um)
-
-
-def _rows(path: Path, sidecar: Sidecar) -> LevelRows:
-    """The map of a file, marks included."""
-    shape, pitch_um, step_um = sidecar.shape_px, sidecar.pitch_um, sidecar.level_height_um
-    if sidecar.format == "stl":
-        px = sidecar.cell_px
-        cells = read_stl_levels(
-            path, (shape[0] // px, shape[1] // px), px * pitch_um, step_um, sidecar.pedestal_um
-        )
-        return cells.repeat(px, 0).repeat(px, 1)
-    if sidecar.format == "gds":
-        assert sidecar.gds_layers is not None
-        return GdsRows(path, shape, pitch_um, sidecar.gds_layers)
-    if sidecar.format == "tiff":
-        return TiffRows(path)
-    if sidecar.format == "gwl":
-        return read_gwl_levels(path, shape, pitch_um, step_um, sidecar.pedestal_um, sidecar.slicing_um)
-    assert sidecar.greys is not None
-    if sidecar.format == "dxf":
-        return read_dxf_levels(path, shape, pitch_um, sidecar.greys)
-    return read_image_levels(path, sidecar.greys)

@@ -1,9 +1,8 @@
-"""Layouts as GDSII, one layer per level in cells that repeat, written and read a band of rows at a time."""
+"""Layouts as GDSII, one layer per level in cells that repeat, written a band of rows at a time."""
 
 from __future__ import annotations
 
 import hashlib
-import struct
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
@@ -18,26 +17,8 @@ _PRECISION_M = 1e-9
 
 # Side of the blocks that a part is cut into.
 _BLOCK_PX = 128
-# Shapes that are read at once.
-_CHUNK = 1 << 10
-
 GdsLayers = Literal["cumulative", "exclusive"]
 Box = tuple[int, int, int, int]
-
-_CELL_NAME, _REFERENCE_NAME, _PLACE, _END_LIBRARY = 0x0606, 0x1206, 0x1003, 0x0400
-
-# One rectangle: the records BOUNDARY, LAYER, DATATYPE 0, XY of five corners, ENDEL, one after the other.
-_RECTANGLE = np.dtype(
-    [
-        ("start", ">u8"),
-        ("layer", ">i2"),
-        ("type", "S6"),
-        ("xy", ">u4"),
-        ("corners", ">i4", (5, 2)),
-        ("end", ">u4"),
-    ]
-)
-_START = 0x0004080000060D02
 
 
 def write_gds(
@@ -118,72 +99,3 @@ def rectangles(masks: np.ndarray) -> np.ndarray:
     new[1:-1] = (np.diff(row) != 1) | np.any(np.diff([mask, left, right]), axis=0)
     first, last = np.flatnonzero(new[:-1]), np.flatnonzero(new[1:])
     return np.stack([mask[first], row[first], row[last] + 1, left[first], right[first]], axis=1)
-
-
-class GdsRows:
-    """The levels of a file of ``write_gds``, uint8, row 0 on top; only the rows asked for are read."""
-
-    def __init__(self, path: Path, shape: tuple[int, int], pitch_um: float, layers: GdsLayers):
-        self.shape = shape
-        self._step, self._layers = pitch_um * _UNIT_M / _PRECISION_M, layers
-        self._path = path
-        self._shapes: dict[str, tuple[int, int]] = {}
-        self._references: dict[str, list[tuple[str, int, int]]] = {}
-        self._index()
-        # Every row of blocks by its lower left corner in pixels.
-        self._bands = [
-            (round((x + dx) / self._step), round((y + dy) / self._step), cell)
-            for name, x, y in self._references["LAYOUT"]
-            for cell, dx, dy in self._references[name]
-        ]
-
-    def __getitem__(self, rows: slice) -> np.ndarray:
-        top, bottom, _ = rows.indices(self.shape[0])
-        low, high = self.shape[0] - bottom, self.shape[0] - top
-        # Each corner of a rectangle adds to everything above and to the right of it.
-        steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
-        for x0, y0, cell in self._bands:
-            if y0 < high and y0 + _BLOCK_PX > low:
-                for name, dx, _ in self._references[cell]:
-                    start, count = self._shapes[name]
-                    shapes = np.fromfile(self._path, _RECTANGLE, count, offset=start)
-                    corners = np.rint(shapes["corners"][:, [0, 2]] / self._step).astype(np.intp)
-                    x = corners[..., 0] + (x0 + round(dx / self._step))
-                    y = np.clip(corners[..., 1] + y0, low, high) - low
-                    weight = shapes["layer"].astype(np.int16) if self._layers == "exclusive" else np.int16(1)
-                    for one, other in ((0, 0), (0, 1), (1, 0), (1, 1)):
-                        np.add.at(steps, (y[:, one], x[:, other]), weight if one == other else -weight)
-        summed = steps.cumsum(0, dtype=np.int16).cumsum(1, dtype=np.int16)
-        return summed[-2::-1, :-1].astype(np.uint8)
-
-    def _index(self) -> None:
-        """Where the shapes of every cell lie in the file, and to which cells it refers."""
-        at, cell, name = 0, "", ""
-        while True:
-            # No record but those of shapes is longer.
-            part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
-            length, kind = struct.unpack(">HH", part[:4])
-            body = part[4:length]
-            if kind == _CELL_NAME:
-                cell = body.rstrip(b"\0").decode()
-                count = self._shapes_from(at + length)
-                self._shapes[cell], self._references[cell] = (at + length, count), []
-                at += count * _RECTANGLE.itemsize
-            if kind == _REFERENCE_NAME:
-                name = body.rstrip(b"\0").decode()
-            elif kind == _PLACE:
-                self._references[cell].append((name, *struct.unpack(">ii", body)))
-            elif kind == _END_LIBRARY:
-                return
-            at += length
-
-    def _shapes_from(self, at: int) -> int:
-        """How many rectangles follow in the file."""
-        count = 0
-        while True:
-            start = at + count * _RECTANGLE.itemsize
-            part = np.fromfile(self._path, _RECTANGLE, _CHUNK, offset=start)
-            other = np.flatnonzero(part["start"] != _START)
-            if other.size or len(part) < _CHUNK:
-                return count + (int(other[0]) if other.size else len(part))
-            count += len(part)

@@ -89,45 +89,6 @@ def write_gwl(
     return lines
 
 
-def read_gwl_levels(
-    path: Path,
-    shape: tuple[int, int],
-    pitch_um: float,
-    level_height_um: float,
-    pedestal_um: float,
-    slicing_um: float,
-) -> np.ndarray:
-    """Levels uint8 (ny, nx), row 0 on top, from the number of slices that lie above one another.
-
-    Raises:
-        InputError: columns of resist that are no whole number of levels.
-    """
-    steps = np.zeros((shape[0], shape[1] + 1), np.int32)
-    stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
-    points: list[list[float]] = []
-    hatched: dict[int, int] = {}
-    with open(path, encoding="ascii") as stream:
-        for words in (line.split() for line in stream):
-            if words[0] in stage:
-                stage[words[0]] += float(words[1])
-            elif words[0] == "Write":
-                (x0, y, _), (x1, _, _) = points
-                row = shape[0] - 1 - int((y + stage["MoveStageY"]) / pitch_um)
-                begin, end = (round((x + stage["MoveStageX"]) / pitch_um) for x in (x0, x1))
-                steps[row, begin] += 1
-                steps[row, end] -= 1
-                hatched[round(1e4 * (y + stage["MoveStageY"]))] = row
-                points = []
-            elif words[0][0] in "-0123456789":
-                points.append([float(word) for word in words])
-    rows_per_px = len(hatched) / shape[0]
-    slices = steps.cumsum(1)[:, :-1] / rows_per_px - pedestal_um / slicing_um
-    found = slices * slicing_um / level_height_um
-    if np.abs(found - np.rint(found)).max() > 1e-6:
-        raise InputError(f"GWL {path}", got="columns between two levels", wanted="whole levels")
-    return np.rint(found).astype(np.uint8)
-
-
 def _head(job: Gwl) -> str:
     mode = {"galvo": "GalvoScanMode", "piezo": "PiezoScanMode\nConnectPointsOn"}[job.mode]
     return (

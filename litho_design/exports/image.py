@@ -100,33 +100,3 @@ def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: 
                 compression="zlib" if big else None, resolution=(per_cm, per_cm),
                 resolutionunit="CENTIMETER", photometric="minisblack",
             )  # fmt: skip
-
-
-class TiffRows:
-    """The levels of a file of ``write_tiff``, uint8; of the file only the strips asked for are read."""
-
-    def __init__(self, path: Path):
-        import tifffile
-        import zarr
-
-        self._page: Any = zarr.open_array(tifffile.imread(path, key=0, aszarr=True), mode="r")
-        self.shape: tuple[int, ...] = self._page.shape
-
-    def __getitem__(self, rows: slice) -> np.ndarray:
-        found: np.ndarray = self._page[rows].astype(np.uint8)
-        return found
-
-
-def read_image_levels(path: Path, greys: Sequence[int]) -> np.ndarray:
-    """Levels uint8 (ny, nx) from an exported PNG or BMP.
-
-    Raises:
-        InputError: no image, or a grey value between two levels.
-    """
-    import cv2
-
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    level = np.searchsorted(greys, grey if grey is not None else [[-1]]).clip(max=len(greys) - 1)
-    if grey is None or (np.array(greys)[level] != grey).any():
-        raise InputError(f"image {path}", got="grey values between levels", wanted=f"one of {list(greys)}")
-    return level.astype(np.uint8)

@@ -1,11 +1,10 @@
-"""Layouts as a closed solid (binary STL, µm), and back."""
+"""Layouts as a closed solid (binary STL, µm)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import shapely
 
 from litho_data.foundation.errors import InputError
 from litho_design.exports.step_solid import step_solid
@@ -45,31 +44,3 @@ def write_stl(
         stream.write(np.uint32(len(records)).astype("<u4").tobytes())
         stream.write(records.tobytes())
     return len(records)
-
-
-def read_stl_triangles(path: Path) -> np.ndarray:
-    """Corners float32 (n, 3, 3) of a binary STL, µm.
-
-    Raises:
-        InputError: a file whose length does not fit its triangle count.
-    """
-    data = path.read_bytes()
-    count = int(np.frombuffer(data, "<u4", 1, _HEADER_BYTES)[0]) if len(data) >= _HEADER_BYTES + 4 else -1
-    if len(data) != _HEADER_BYTES + 4 + count * _RECORD.itemsize:
-        raise InputError(f"STL {path}", got=f"{len(data)} bytes", wanted="a whole binary STL")
-    return np.frombuffer(data, _RECORD, count, _HEADER_BYTES + 4)["corners"]
-
-
-def read_stl_levels(
-    path: Path, shape: tuple[int, int], cell_um: float, level_height_um: float, pedestal_um: float
-) -> np.ndarray:
-    """Levels per cell uint8 (ny, nx), row 0 on top, from the flat faces on top of the solid."""
-    corners = read_stl_triangles(path).astype(np.float64)
-    flat = corners[(np.ptp(corners[..., 2], axis=1) == 0) & (corners[:, 0, 2] > 0)]
-    level = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um).astype(np.int64)
-    faces = shapely.STRtree(shapely.polygons(flat[..., :2] / cell_um))
-    found = np.zeros(shape, np.uint8)
-    for row, middle in enumerate(np.arange(shape[0]) + 0.5):
-        column, face = faces.query(shapely.points(np.arange(shape[1]) + 0.5, middle), predicate="intersects")
-        found[row, column] = level[face]
-    return found[::-1]

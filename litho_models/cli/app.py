@@ -236,7 +236,7 @@ def benchmark(
 @app.command()
 def predict(
     model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
-    layout: Annotated[Path, typer.Argument(help="TIFF, PNG, BMP or NPY of levels")],
+    layout: Annotated[Path, typer.Argument(help="TIFF, PNG, BMP or NPY of levels, or any exported file")],
     out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="accept levels beyond the calibrated range")

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from litho_data.level.scan import write_heights
+from litho_data.readers.exported import export_of
 from litho_data.readers.layout import read_layout
 from litho_data.store import PrintedScan, Store
 from litho_models.frozen.simulator import FrozenSimulator
@@ -19,7 +20,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """Predict the print of a layout of levels and write its height to ``out``; returns it, (ny, nx) µm.
 
     Args:
-        layout: TIFF, PNG, BMP or NPY of integer levels or of their grey values, sampled at the model's pitch.
+        layout: TIFF, PNG, BMP or NPY of integer levels or of their grey values, sampled at the model's pitch;
+            or any export of the design package, whose sidecar states pitch and level height.
         out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
 
     Raises:
@@ -27,7 +29,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])
-    height = model.predict(levels * np.float32(model.card["level_height_um"]))
+    says = {"pitch_um": pitch_um, "level_height_um": model.card["level_height_um"], **export_of(Path(layout))}
+    height = model.predict(levels * np.float32(says["level_height_um"]), pitch_um=says["pitch_um"])
     write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")
     return height
 

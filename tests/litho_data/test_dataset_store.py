@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,6 +152,26 @@ def test_a_copy_or_a_part_by_xarray_is_a_store_again(campaign: Path, tmp_path: P
         assert float(back.sel(x=5.04, y=1.01, method="nearest")["x_um"]) == pytest.approx(5.05)
 
 
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (lambda whole: whole.isel(y=slice(16, 80)), "y_um of"),
+        (lambda whole: whole.isel(x=slice(None, None, -1)), "x_um of"),
+        (lambda whole: whole.isel(y=slice(None, None, 2), x=slice(None, None, 2)), "y_um of"),
+        (lambda whole: whole.transpose("scan", "x", "y", ...), "dimensions of mask_level"),
+    ],
+)
+def test_a_part_with_other_pixels_is_refused(
+    campaign: Path, tmp_path: Path, part: Callable[[Any], Any], words: str
+) -> None:
+    import xarray
+
+    whole = xarray.open_zarr(campaign / "prints.zarr")
+    part(whole).drop_encoding().to_zarr(tmp_path / "part.zarr")
+    with pytest.raises(InputError, match=words):
+        open_store(tmp_path / "part.zarr")
+
+
 def test_a_copy_by_xarray_may_lack_what_states_nothing_and_no_more(campaign: Path, tmp_path: Path) -> None:
     import xarray
 
@@ -192,6 +214,10 @@ def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
     ome = root["scans/P12"].attrs["ome"]
     (image,) = ome["multiscales"]
     (dataset,) = image["datasets"]
-    assert (ome["version"], [axis["name"] for axis in image["axes"]]) == ("0.5", ["y", "x"])
+    assert ome["version"] == "0.5"
+    # OME-NGFF 0.5: axes and dimensions of the array must have the same names.
+    dimensions = root["scans/P12"][dataset["path"]].metadata.dimension_names
+    assert tuple(axis["name"] for axis in image["axes"]) == dimensions
+    assert {(axis["type"], axis["unit"]) for axis in image["axes"]} == {("space", "micrometer")}
     assert dataset["coordinateTransformations"] == [{"type": "scale", "scale": [0.1, 0.1]}]
     assert root["scans/P12"][dataset["path"]].shape == (128, 128)

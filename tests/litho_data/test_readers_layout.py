@@ -18,7 +18,8 @@ LEVEL = (np.arange(60).reshape(6, 10) * 7 % 13).astype(np.uint8)
 
 
 def with_sidecar(path: Path, **says: object) -> Path:
-    content = {"schema": "litho-design/export/1", "file_sha256": file_sha256(path), **says}
+    content = {"schema": "litho-design/export/2", "file_sha256": file_sha256(path), "format": "png16"}
+    content |= {"shape_px": LEVEL.shape, "pitch_um": 0.1, "level_height_um": 0.1, **says}
     path.with_name(f"{path.name}.json").write_text(json.dumps(content))
     return path
 
@@ -47,9 +48,12 @@ def test_grey_values_that_are_no_steps_are_refused(tmp_path: Path) -> None:
 def test_exported_files_are_read_by_their_sidecar(tmp_path: Path) -> None:
     picture = tmp_path / "layout.png"
     cv2.imwrite(str(picture), LEVEL.astype(np.uint16) * 5461)
-    np.testing.assert_array_equal(read_layout(with_sidecar(picture, grey_per_level=5461)), LEVEL)
+    # The second schema has the greys of a measured curve, the first had a step.
+    greys = [5461 * level for level in range(13)]
+    for says in ({"greys": greys}, {"levels": 13, "grey_per_level": 5461}):
+        np.testing.assert_array_equal(read_layout(with_sidecar(picture, **says)), LEVEL)
     marks = {"element_px": [1, 5, 2, 9]}
-    cropped = read_layout(with_sidecar(picture, grey_per_level=5461, marks=marks))
+    cropped = read_layout(with_sidecar(picture, greys=greys, marks=marks))
     np.testing.assert_array_equal(cropped, LEVEL[1:5, 2:9])
     pages = tmp_path / "layout.tif"
     with tifffile.TiffWriter(pages) as file:
@@ -57,7 +61,9 @@ def test_exported_files_are_read_by_their_sidecar(tmp_path: Path) -> None:
         file.write(LEVEL * np.float32(0.1))
     with pytest.raises(InputError, match="pages, got 2"):
         read_layout(pages)
-    np.testing.assert_array_equal(read_layout(with_sidecar(pages, grey_per_level=1)), LEVEL)
+    np.testing.assert_array_equal(read_layout(with_sidecar(pages, format="tiff")), LEVEL)
+    with pytest.raises(InputError, match="greys"):
+        read_layout(with_sidecar(picture, format="dxf"))
     cv2.imwrite(str(picture), LEVEL.astype(np.uint16) * 5000)
     with pytest.raises(InputError, match="another file than its sidecar says"):
         read_layout(picture)

@@ -13,7 +13,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.noise import freed_of_noise
-from litho_design.images.photograph import PhotoSource
+from litho_design.images.photograph import PhotoSource, _saturated
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
@@ -233,6 +233,16 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     ):
         with pytest.raises(InputError, match=why):
             scored(**camera)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_the_end_of_a_range_is_found_in_the_pixels_and_not_in_the_container(bits):
+    """A camera of 12 bits writes files of 16, whose largest value no pixel has."""
+    light = np.random.default_rng(0).uniform(0, 1, (100, 100)) ** 2 * 2**bits
+    assert _saturated(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
+        0.046, abs=0.01
+    )
+    assert _saturated((light * 0.8).astype(np.uint16)) == 0.0
 
 
 class Power(Record):

@@ -14,7 +14,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.images.targets import draw_target, object_name
 from litho_design.judging.gap import GapResult
-from litho_design.lenses.objects import object_stack, picture_records, with_objects
+from litho_design.lenses.objects import object_stack, picture_records, read_object, with_objects
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import LensTask, lens_task
 from litho_design.optics import Optics
@@ -107,6 +107,16 @@ def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_ou
     names = [f"{index:02d}.png" for index in range(count)]
     assert [object_name(item) for item in imaging.objects] == names[:-held_out]
     assert [object_name(item) for item in imaging.test_objects] == names[-held_out:]
+
+
+def test_transparent_pixels_are_dark(tmp_path):
+    """A logo is white all over, and its shape stands in the alpha channel."""
+    shape = np.zeros((40, 40), np.uint8)
+    shape[8:16, 4:30] = 255
+    logo = np.dstack([np.full((40, 40, 3), 255, np.uint8), shape])
+    cv2.imwrite(str(tmp_path / "logo.png"), logo)
+    cv2.imwrite(str(tmp_path / "grey.png"), shape)
+    np.testing.assert_allclose(*(read_object(tmp_path / f"{name}.png", 20)[0] for name in ("logo", "grey")))
 
 
 def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, settings, make_printer):

@@ -1,0 +1,219 @@
+"""Files that the design package wrote for a printer, read back as levels by the sidecar beside each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.kinds import Array, Shape
+from litho_data.readers.gds_rows import GdsRows
+
+_SCHEMA = "litho-design/export/"
+_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_HEADER_BYTES = 80
+
+
+def export_of(file: Path) -> dict[str, Any]:
+    """What the design package wrote about an exported file; empty for other files.
+
+    Raises:
+        InputError: the sidecar is that of another file.
+    """
+    path = file.with_name(f"{file.name}.json")
+    try:
+        says = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):
+        return {}
+    if says.get("file_sha256") != file_sha256(file):
+        raise InputError(f"layout {file}", got="another file than its sidecar says", wanted=str(path))
+    return says
+
+
+def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
+    """Levels of the element alone, uint8 (ny, nx), row 0 on top.
+
+    Raises:
+        InputError: a sidecar without what describes the file, or a file that is not as it says.
+    """
+    levels = exported_rows(path, says)[:]
+    if marks := says.get("marks"):
+        top, bottom, left, right = marks["element_px"]
+        levels = levels[top:bottom, left:right].copy()
+    return levels
+
+
+def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
+    """The levels of a whole file, marks included; of TIFF and GDS only the rows that are cut out are read.
+
+    Raises:
+        InputError: as ``exported_levels``.
+    """
+    with damaged(f"{path}.json"):
+        shape, pitch_um, step_um = tuple(says["shape_px"]), says["pitch_um"], says["level_height_um"]
+        match says["format"]:
+            case "stl":
+                px = says.get("cell_px", 1)
+                cells = shape[0] // px, shape[1] // px
+                found = read_stl_levels(path, cells, px * pitch_um, step_um, says["pedestal_um"])
+                return found.repeat(px, 0).repeat(px, 1)
+            case "gds":
+                return GdsRows(path, shape, pitch_um, says["gds_layers"])
+            case "tiff":
+                return TiffRows(path)
+            case "gwl":
+                return _gwl_levels(path, shape, pitch_um, step_um, says["pedestal_um"], says["slicing_um"])
+            case "dxf":
+                return _dxf_levels(path, shape, pitch_um, says["greys"])
+        # The first schema had a step in place of the greys.
+        greys = says.get("greys") or (np.arange(says["levels"]) * says["grey_per_level"]).tolist()
+        return _image_levels(path, greys)
+
+
+class TiffRows:
+    """The levels on the first page of a TIFF, uint8; of the file only the strips asked for are read."""
+
+    def __init__(self, path: Path):
+        import tifffile
+        import zarr
+
+        self._page: Any = zarr.open_array(tifffile.imread(path, key=0, aszarr=True), mode="r")
+        self.shape: tuple[int, ...] = self._page.shape
+
+    def __getitem__(self, rows: slice) -> Array:
+        found: Array = self._page[rows].astype(np.uint8)
+        return found
+
+
+def _image_levels(path: Path, greys: Sequence[int]) -> Array:
+    """Levels uint8 (ny, nx) from an exported PNG or BMP.
+
+    Raises:
+        InputError: no image, or a grey value between two levels.
+    """
+    import cv2
+
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    level = np.searchsorted(greys, grey if grey is not None else [[-1]]).clip(max=len(greys) - 1)
+    if grey is None or (np.array(greys)[level] != grey).any():
+        raise InputError(f"image {path}", got="grey values between levels", wanted=f"one of {list(greys)}")
+    return level.astype(np.uint8)
+
+
+def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
+    """Levels uint8 (ny, nx), row 0 on top, from closed polylines."""
+    level_of = {grey: level for level, grey in enumerate(greys)}
+    found = np.full(shape, level_of.get(0, 0), np.uint8)
+    layer, x, corners = 0, 0.0, []
+    for code, value in _pairs(path):
+        if code == "8":
+            layer = int(value)
+        elif code == "10":
+            x = float(value)
+        elif code == "20":
+            corners.append((x / pitch_um, shape[0] - float(value) / pitch_um))
+        elif value == "POLYLINE":
+            corners = []
+        elif value == "SEQEND":
+            (left, top), (right, bottom) = (
+                np.rint(edge(corners[1:], axis=0)).astype(int) for edge in (np.min, np.max)
+            )
+            found[top:bottom, left:right] = level_of[layer]
+    return found
+
+
+def _pairs(path: Path) -> Iterator[tuple[str, str]]:
+    with open(path, encoding="ascii") as stream:
+        for code in stream:
+            yield code.strip(), next(stream).strip()
+
+
+def _gwl_levels(
+    path: Path,
+    shape: Shape,
+    pitch_um: float,
+    level_height_um: float,
+    pedestal_um: float,
+    slicing_um: float,
+) -> Array:
+    """Levels uint8 (ny, nx), row 0 on top, from the number of slices that lie above one another.
+
+    Raises:
+        InputError: columns of resist that are no whole number of levels.
+    """
+    steps = np.zeros((shape[0], shape[1] + 1), np.int32)
+    stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
+    points: list[list[float]] = []
+    hatched: dict[int, int] = {}
+    with open(path, encoding="ascii") as stream:
+        for words in (line.split() for line in stream):
+            if words[0] in stage:
+                stage[words[0]] += float(words[1])
+            elif words[0] == "Write":
+                (x0, y, _), (x1, _, _) = points
+                row = shape[0] - 1 - int((y + stage["MoveStageY"]) / pitch_um)
+                begin, end = (round((x + stage["MoveStageX"]) / pitch_um) for x in (x0, x1))
+                steps[row, begin] += 1
+                steps[row, end] -= 1
+                hatched[round(1e4 * (y + stage["MoveStageY"]))] = row
+                points = []
+            elif words[0][0] in "-0123456789":
+                points.append([float(word) for word in words])
+    rows_per_px = len(hatched) / shape[0]
+    slices = steps.cumsum(1)[:, :-1] / rows_per_px - pedestal_um / slicing_um
+    found = slices * slicing_um / level_height_um
+    if np.abs(found - np.rint(found)).max() > 1e-6:
+        raise InputError(f"GWL {path}", got="columns between two levels", wanted="whole levels")
+    return np.rint(found).astype(np.uint8)
+
+
+def read_stl_triangles(path: Path) -> Array:
+    """Corners float32 (n, 3, 3) of a binary STL, µm.
+
+    Raises:
+        InputError: a file whose length does not fit its triangle count.
+    """
+    data = path.read_bytes()
+    count = (
+        int(np.frombuffer(data, "<u4", 1, _STL_HEADER_BYTES)[0]) if len(data) >= _STL_HEADER_BYTES + 4 else -1
+    )
+    if len(data) != _STL_HEADER_BYTES + 4 + count * _STL.itemsize:
+        raise InputError(f"STL {path}", got=f"{len(data)} bytes", wanted="a whole binary STL")
+    return np.frombuffer(data, _STL, count, _STL_HEADER_BYTES + 4)["corners"]
+
+
+def read_stl_levels(
+    path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
+) -> Array:
+    """Levels per cell uint8 (ny, nx), row 0 on top, from the flat faces on top of the solid.
+
+    Along the middle of every row of cells each face covers the cells between two of its edges.
+    """
+    corners = read_stl_triangles(path).astype(np.float64)
+    flat = corners[(np.ptp(corners[..., 2], axis=1) == 0) & (corners[:, 0, 2] > 0)]
+    level = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um).astype(np.int64)
+    places = flat[..., :2] / cell_um
+    first, last = (np.ceil(edge(places[..., 1], axis=1) - 0.5).astype(int) for edge in (np.min, np.max))
+    face = np.repeat(np.arange(len(flat)), last - first)
+    row = np.arange(len(face)) + np.repeat(last - np.cumsum(last - first), last - first)
+    ends = np.array([[np.inf], [-np.inf]]).repeat(len(face), 1)
+    for one, other in ((0, 1), (1, 2), (2, 0)):
+        low, high = places[face, one], places[face, other]
+        # From the lower end in every face: both faces at an edge meet it at the same number.
+        down = (low[:, 1] > high[:, 1])[:, None]
+        (x0, y0), (x1, y1) = np.where(down, high, low).T, np.where(down, low, high).T
+        met = (y0 <= row + 0.5) & (row + 0.5 < y1)
+        x = x0[met] + (row[met] + 0.5 - y0[met]) / (y1 - y0)[met] * (x1 - x0)[met]
+        ends[0, met], ends[1, met] = np.minimum(ends[0, met], x), np.maximum(ends[1, met], x)
+    begin, end = np.ceil(ends - 0.5).astype(int)
+    steps = np.zeros((shape[0], shape[1] + 1), np.int64)
+    np.add.at(steps, (row, begin), level[face])
+    np.add.at(steps, (row, end), -level[face])
+    return steps.cumsum(1)[::-1, :-1].astype(np.uint8)
