@@ -51,7 +51,6 @@ def register() -> None:
             acts_on="height",
             parameters={"depth_um": Parameter("µm", 0.0, 0.3, 0.03)},
             apply=sinking_layers,
-            trials=({"depth_um": 0.03},),
             source="an example",
             separating="print staircases with and without the promoter",
         )

@@ -7,27 +7,48 @@ import math
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_development
-from litho_models.effects.filters import add_blur, add_warp, gradient
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_development
+from litho_models.effects.filters import add_warp, dose_nearby, gradient
 
-_SLOPE_SOURCE = "empirical: loss along a power of the slope, one coefficient per axis"
+_OF_NARROW = {
+    "fraction": Parameter("1", 0.0, 0.9, 0.1),
+    "width_um": Parameter("µm", 0.2, 3.0, 0.5, "shape", tried=(0.4, 0.8, 1.4)),
+}
 # Slope below which a power of it is rounded off, so that it has a derivative.
 _LEAST_SLOPE = 1e-3
 
 
+@of_development(
+    "the whole print losing height on development",
+    {"fraction": Parameter("1", 0.0, 0.7, 0.05)},
+    source="Meisel 2006, cited in the paper",
+    separating="a step standard for the microscope, then a printed staircase",
+)
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """(1 - k) H: the whole print loses height."""
     return (1 - values["fraction"]) * height
 
 
+@of_development(
+    "thin surroundings shrinking more than thick ones",
+    {
+        "fraction": Parameter("1", 0.0, 0.5, 0.1),
+        "length_um": Parameter("µm", 0.3, 6.0, 1.0, "shape", tried=(0.5, 1.5, 4.0)),
+    },
+    source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
+    separating="print the same height inside low and high surroundings; a power sweep",
+)
 def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H (1 - k (1 - u)), u the relative nominal height nearby: thin surroundings shrink more."""
-    length = values["length_um"]
-    relative = context.layout_um / context.full_height_um
-    dose = add_blur(relative, length**2, context.pitch_um, 3 * float(length.detach()))
-    return height * (1 - values["fraction"] * (1 - dose))
+    return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
 
 
+@of_development(
+    "tops shrinking towards the centre of the field",
+    {"fraction": Parameter("1", 0.0, 0.1, 0.005)},
+    source="print bound to the substrate at its base, free at its top",
+    separating="print the layout in fields of two sizes",
+)
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H(r + s H(r) / full r), r from the centre of the field: tops pull in, more than bases.
 
@@ -45,11 +66,23 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     return looked_up(raw * (1 + share * looked_up(raw)[0, 0]))
 
 
+@of_development(
+    "narrow tall features losing height",
+    _OF_NARROW,
+    source="capillary force while drying; opening of the surface by a square of width w",
+    separating="pillars of one height and five widths, dried in air and supercritically",
+)
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H - φ (H - open_w(H)): what is narrower than w loses a share of its height above its surroundings."""
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
 
+@of_development(
+    "resist left in narrow trenches",
+    _OF_NARROW,
+    source="closing of the surface by a square of width w",
+    separating="trenches of five widths, developed for two times",
+)
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + ρ (close_w(H) - H): resist stays in pits narrower than w; tops are unchanged."""
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
@@ -78,6 +111,22 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
     return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
 
 
+@of_development(
+    "height missing on slopes",
+    {
+        "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
+        "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
+        "exponent": Parameter("1", 0.7, 3.0, 2.0, "shape"),
+    },
+    role="undetermined",
+    trials=tuple(
+        {**axes, "exponent": power}
+        for power in (1.0, 2.0)
+        for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
+    ),
+    source="empirical: loss along a power of the slope, one coefficient per axis",
+    separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
+)
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H - cx |dH/dx|^p - cy |dH/dy|^p: height missing on slopes, by axis.
 
@@ -89,81 +138,3 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
         for slope in gradient(height, context.pitch_um)
     )
     return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y
-
-
-_OF_NARROW = {
-    "fraction": Parameter("1", 0.0, 0.9, 0.1),
-    "width_um": Parameter("µm", 0.2, 3.0, 0.5, kind="shape"),
-}
-_NARROW = tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4))
-
-EFFECTS = (
-    of_development(
-        name="vertical-shrinkage",
-        title="the whole print losing height on development",
-        parameters={"fraction": Parameter("1", 0.0, 0.7, 0.05)},
-        apply=vertical_shrinkage,
-        trials=({"fraction": 0.05},),
-        source="Meisel 2006, cited in the paper",
-        separating="a step standard for the microscope, then a printed staircase",
-    ),
-    of_development(
-        name="dose-dependent-shrinkage",
-        title="thin surroundings shrinking more than thick ones",
-        parameters={
-            "fraction": Parameter("1", 0.0, 0.5, 0.1),
-            "length_um": Parameter("µm", 0.3, 6.0, 1.0, kind="shape"),
-        },
-        apply=dose_dependent_shrinkage,
-        trials=tuple({"fraction": 0.1, "length_um": length} for length in (0.5, 1.5, 4.0)),
-        source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
-        separating="print the same height inside low and high surroundings; a power sweep",
-    ),
-    of_development(
-        name="lateral-shrinkage",
-        title="tops shrinking towards the centre of the field",
-        parameters={"fraction": Parameter("1", 0.0, 0.1, 0.005)},
-        apply=lateral_shrinkage,
-        trials=({"fraction": 0.005},),
-        source="print bound to the substrate at its base, free at its top",
-        separating="print the layout in fields of two sizes",
-    ),
-    of_development(
-        name="feature-collapse",
-        title="narrow tall features losing height",
-        parameters=_OF_NARROW,
-        apply=feature_collapse,
-        trials=_NARROW,
-        source="capillary force while drying; opening of the surface by a square of width w",
-        separating="pillars of one height and five widths, dried in air and supercritically",
-    ),
-    of_development(
-        name="trench-residue",
-        title="resist left in narrow trenches",
-        parameters=_OF_NARROW,
-        apply=trench_residue,
-        trials=_NARROW,
-        source="closing of the surface by a square of width w",
-        separating="trenches of five widths, developed for two times",
-    ),
-    Effect(
-        name="slope-thinning",
-        title="height missing on slopes",
-        stage="development",
-        role="undetermined",
-        acts_on="height",
-        parameters={
-            "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
-            "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
-            "exponent": Parameter("1", 0.7, 3.0, 2.0, kind="shape"),
-        },
-        apply=slope_thinning,
-        trials=tuple(
-            {**axes, "exponent": power}
-            for power in (1.0, 2.0)
-            for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
-        ),
-        source=_SLOPE_SOURCE,
-        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
-    ),
-)

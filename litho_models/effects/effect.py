@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from itertools import product
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -37,6 +38,7 @@ class Parameter:
             without meaning while the amplitudes are null; ``choice`` is a shape that takes few
             values (a direction) and is never fitted.
         null: the amplitude's value at which the effect is the identity.
+        tried: values that screening tries; ``typical`` if there are none.
     """
 
     unit: str
@@ -45,6 +47,7 @@ class Parameter:
     typical: float
     kind: Kind = "amplitude"
     null: float = 0.0
+    tried: tuple[float, ...] = ()
 
     @property
     def off(self) -> float:
@@ -98,15 +101,14 @@ class FieldContext:
         """The same field as the microscope saw it, its fast axis along x."""
         if not self.quarter_turns % 4:
             return self
-        shape, (top, left) = self.layout_um.shape[-2:], self.origin_px
-        below = self.whole_shape()[0] - top - shape[0]
-        right = self.whole_shape()[1] - left - shape[1]
+        (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
+        below, right = whole[0] - top - ny, whole[1] - left - nx
         corners = [(top, left), (right, top), (below, right), (left, below)]
         turn = self.quarter_turns % 4
         return replace(
             self,
             layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),
-            scan_shape=self.whole_shape()[::-1] if turn % 2 else self.whole_shape(),
+            scan_shape=whole[::-1] if turn % 2 else whole,
             origin_px=corners[turn],
             scan_line=None if self.scan_line is None else torch.rot90(self.scan_line, turn),
             quarter_turns=0,
@@ -114,13 +116,9 @@ class FieldContext:
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
         """(y, x) of each pixel from the centre of the write field: shapes (y, 1) and (1, x), µm."""
-        y, x = (
-            (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) - (n - 1) / 2)
-            * self.pitch_um
-            + centre
-            for n, centre in zip(self.layout_um.shape[-2:], self.field_centre_um, strict=True)
-        )
-        return y[:, None], x[None, :]
+        rows, columns = self._pixels()
+        (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
+        return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
 
     def whole_shape(self) -> tuple[int, int]:
         """(rows, columns) of the whole scan."""
@@ -128,15 +126,14 @@ class FieldContext:
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
         """(y, x) of each pixel from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
-        y, x = (
-            2
-            * (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) + start)
-            / max(whole - 1, 1)
-            - 1
-            for n, start, whole in zip(
-                self.layout_um.shape[-2:], self.origin_px, self.whole_shape(), strict=True
-            )
-        )
+        rows, columns = self._pixels()
+        (ny, nx), (top, left) = self.whole_shape(), self.origin_px
+        return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
+
+    def _pixels(self) -> tuple[Tensor, Tensor]:
+        """Row and column of each pixel, shapes (y, 1) and (1, x)."""
+        layout = self.layout_um
+        y, x = (torch.arange(n, dtype=layout.dtype, device=layout.device) for n in layout.shape[-2:])
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
@@ -168,7 +165,7 @@ class Effect:
         parameters: name to ``Parameter``; at least one amplitude.
         apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm.
         trials: parameter sets (those not named are off) at which screening takes the secant
-            direction; one per separate direction or length scale.
+            direction; by default one amplitude at a time, at each of its values to be tried, in each shape.
         source: where the formula comes from.
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
@@ -202,6 +199,16 @@ class Effect:
         if not amplitudes:
             raise InputError(f"effect {self.name}", got="no amplitude", wanted="at least one")
         object.__setattr__(self, "amplitudes", amplitudes)
+        if not (self.trials or self.per_scan):
+            object.__setattr__(self, "trials", tuple(self._trials()))
+
+    def _trials(self) -> Iterator[dict[str, float]]:
+        shapes = {n: p.tried for n, p in self.parameters.items() if n not in self.amplitudes and p.tried}
+        for shape in product(*shapes.values()):
+            for name in self.amplitudes:
+                facts = self.parameters[name]
+                for value in facts.tried or (facts.typical,):
+                    yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
         """Parameters at which the effect is the identity."""
@@ -250,8 +257,26 @@ class Effect:
         return torch.rot90(seen, -turn, (-2, -1))
 
 
-# The entries of most effects, by where they happen: called like ``Effect``, without these three fields.
-of_exposure = partial(Effect, stage="exposure", role="process", acts_on="layout")
-of_resist = partial(Effect, stage="resist", role="process", acts_on="height")
-of_development = partial(Effect, stage="development", role="process", acts_on="height")
-of_microscope = partial(Effect, stage="measurement", role="measurement", acts_on="height")
+def entry(
+    title: str,
+    parameters: Mapping[str, Parameter],
+    *,
+    stage: Stage,
+    role: Role,
+    acts_on: ActsOn,
+    **facts: Any,
+) -> Callable[[Apply], Effect]:
+    """Makes an effect of a formula, under the formula's name; ``facts``: the other fields of ``Effect``."""
+
+    def of_formula(apply: Apply) -> Effect:
+        name = apply.__name__.replace("_", "-")
+        return Effect(name, title, stage, role, acts_on, parameters, apply, **facts)
+
+    return of_formula
+
+
+# Where most effects happen; an entry that differs says so.
+of_exposure = partial(entry, stage="exposure", role="process", acts_on="layout")
+of_resist = partial(entry, stage="resist", role="process", acts_on="height")
+of_development = partial(entry, stage="development", role="process", acts_on="height")
+of_microscope = partial(entry, stage="measurement", role="measurement", acts_on="height")

@@ -7,27 +7,42 @@ import math
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_filtered, add_warp, centred_lag, gradient, trailing_response
 
 _TAIL_LENGTHS = 6
 # A slower wave is no ripple: maps of the field look like it.
 _SLOWEST_PER_UM = 0.19
+_RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
 
+@of_exposure(
+    "beam lagging behind the scan command along the written lines",
+    {
+        "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    source="first-order lag of the deflection, l = speed x time constant",
+    separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+)
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The beam follows the command late: one-sided exponential of length l = v τ, without its mean delay."""
-    length = values["length_um"]
-    forward = float(values["direction"]) > 0
+    length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
         along = fx if context.slow_axis == "y" else fy
-        return centred_lag(along if forward else -along, length, context.pitch_um) - 1
+        return centred_lag(direction * along, length, pitch) - 1
 
-    reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+    return add_filtered(layout, transfer_minus_one, pitch, _TAIL_LENGTHS * float(length.detach()) + pitch)
 
 
+@of_exposure(
+    "written lines that begin and end too late",
+    {axis: Parameter("µm", -0.6, 0.6, 0.1) for axis in ("along_x_um", "along_y_um")},
+    trials=({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1}),
+    source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
+    separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
+)
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line loses δ at both ends, or gains it.
 
@@ -37,6 +52,12 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
 
 
+@of_exposure(
+    "scanner of the printer running unevenly along the written lines",
+    {"strength": Parameter("1", -0.05, 0.05, 0.005)},
+    source="distortion of the write field by a galvo or a stage, quadratic along the line",
+    separating="scan each print at 0 and 90 degrees; scan a calibration grating",
+)
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """M(x + c (r² / 3 - x²) / 2R) along the written lines, x from the centre of a field of half width r.
 
@@ -51,22 +72,45 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     return add_warp(layout, *shifts, context.pitch_um)
 
 
+@of_exposure(
+    "resist remembering what was written just before",
+    {
+        "strength": Parameter("1", -0.6, 0.6, 0.05),
+        "length_um": Parameter("µm", 0.4, 20.0, 3.0, "shape", tried=(1.0, 3.0, 9.0)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    stage="resist",
+    source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
+    separating="print the same layout with the writing order reversed",
+)
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: the lines before starve the resist."""
-    strength, length = values["strength"], values["length_um"]
-    onwards = float(values["direction"]) > 0
+    strength, length, direction = values["strength"], values["length_um"], values["direction"]
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
         along = fy if context.slow_axis == "y" else fx
-        return -strength * trailing_response(along if onwards else -along, length, context.pitch_um)
+        return -strength * trailing_response(direction * along, length, context.pitch_um)
 
-    reach = _TAIL_LENGTHS * float(length.detach())
-    starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+    reach_um = _TAIL_LENGTHS * float(length.detach())
+    starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
     # Where another effect has left a negative dose, that is not for this one to mend.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 
 
+@of_exposure(
+    "ripples at the hatching pitch",
+    {
+        "cosine_um": Parameter("µm", -0.1, 0.1, 0.01),
+        "sine_um": Parameter("µm", -0.1, 0.1, 0.01),
+        "frequency_per_um": Parameter("1/µm", _SLOWEST_PER_UM, 0.7, 0.3, "shape", tried=_RIPPLES_PER_UM),
+    },
+    role="nuisance",
+    acts_on="height",
+    source="ripples of the paper's noise figure, at 0.1 µm pitch",
+    separating="rescan at 25 nm per pixel",
+    along_lines=True,
+)
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
 
@@ -79,100 +123,17 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     return height + (context.layout_um > 0).to(height.dtype) * ripple
 
 
+@of_exposure(
+    "height of the single written line",
+    {"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
+    role="nuisance",
+    acts_on="height",
+    source="arXiv:2309.17343, line-like noise along the hatching; random, so no model predicts it",
+    separating="scan the same field at 0 and 90 degrees",
+    per_scan=True,
+)
 def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + s_i, s_i ~ N(0, σ²) for each row i of the layout, drawn anew for every print."""
     generator = torch.Generator().manual_seed(context.seed)
     draws = torch.randn(height.shape[-2], generator=generator).to(height)
     return height + values["sd_um"] * draws[:, None]
-
-
-EFFECTS = (
-    of_exposure(
-        name="galvo-lag",
-        title="beam lagging behind the scan command along the written lines",
-        parameters={
-            "length_um": Parameter("µm", 0.0, 1.5, 0.2),
-            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
-        },
-        apply=galvo_lag,
-        trials=tuple(
-            {"length_um": length, "direction": sign} for length in (0.15, 0.4) for sign in (1.0, -1.0)
-        ),
-        source="first-order lag of the deflection, l = speed x time constant",
-        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
-    ),
-    of_exposure(
-        name="line-shortening",
-        title="written lines that begin and end too late",
-        parameters={
-            "along_x_um": Parameter("µm", -0.6, 0.6, 0.1),
-            "along_y_um": Parameter("µm", -0.6, 0.6, 0.1),
-        },
-        apply=line_shortening,
-        trials=({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1}),
-        source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
-        separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
-    ),
-    of_exposure(
-        name="galvo-nonlinearity",
-        title="scanner of the printer running unevenly along the written lines",
-        parameters={"strength": Parameter("1", -0.05, 0.05, 0.005)},
-        apply=galvo_nonlinearity,
-        trials=({"strength": 0.005},),
-        source="distortion of the write field by a galvo or a stage, quadratic along the line",
-        separating="scan each print at 0 and 90 degrees; scan a calibration grating",
-    ),
-    Effect(
-        name="write-order-memory",
-        title="resist remembering what was written just before",
-        stage="resist",
-        role="process",
-        acts_on="layout",
-        parameters={
-            "strength": Parameter("1", -0.6, 0.6, 0.05),
-            "length_um": Parameter("µm", 0.4, 20.0, 3.0, kind="shape"),
-            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
-        },
-        apply=write_order_memory,
-        trials=tuple(
-            {"strength": 0.05, "length_um": length, "direction": sign}
-            for length in (1.0, 3.0, 9.0)
-            for sign in (1.0, -1.0)
-        ),
-        source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
-        separating="print the same layout with the writing order reversed",
-    ),
-    Effect(
-        name="hatch-ripple",
-        title="ripples at the hatching pitch",
-        stage="exposure",
-        role="nuisance",
-        acts_on="height",
-        parameters={
-            "cosine_um": Parameter("µm", -0.1, 0.1, 0.01),
-            "sine_um": Parameter("µm", -0.1, 0.1, 0.01),
-            "frequency_per_um": Parameter("1/µm", _SLOWEST_PER_UM, 0.7, 0.3, kind="shape"),
-        },
-        apply=hatch_ripple,
-        trials=tuple(
-            {part: 0.01, "frequency_per_um": round(0.2 + 0.02 * i, 2)}
-            for i in range(21)
-            for part in ("cosine_um", "sine_um")
-        ),
-        source="ripples of the paper's noise figure, at 0.1 µm pitch",
-        separating="rescan at 25 nm per pixel",
-        along_lines=True,
-    ),
-    Effect(
-        name="line-roughness",
-        title="height of the single written line",
-        stage="exposure",
-        role="nuisance",
-        acts_on="height",
-        parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
-        apply=line_roughness,
-        source="arXiv:2309.17343, line-like noise along the hatching; random, so no model predicts it",
-        separating="scan the same field at 0 and 90 degrees",
-        per_scan=True,
-    ),
-)

@@ -10,6 +10,8 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
+from litho_models.effects.effect import FieldContext
+
 
 def add_filtered(
     field: Tensor,
@@ -45,6 +47,12 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
         pitch_um,
         reach_um,
     )
+
+
+def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
+    """Mean relative nominal height within that length of each pixel (1, 1, y, x)."""
+    relative = context.layout_um / context.full_height_um
+    return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:

@@ -11,6 +11,17 @@ from litho_models.effects.filters import add_blur, add_warp
 _BLUR_REACH_UM = 4.0
 
 
+@of_microscope(
+    "probe lagging behind the surface along the fast axis",
+    {
+        "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
+        "rising": Parameter("1", 0.0, 1.0, 0.5, "shape", tried=(1.0, 0.4)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
+    separating="compare trace and retrace; scan at 0 and 90 degrees",
+    reverses=("direction",),
+)
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The probe follows late along the fast axis, mean delay taken out: z += (H - z) / (1 + l / dx).
 
@@ -34,6 +45,19 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     )
 
 
+@of_microscope(
+    "shift and distortion left by the registration",
+    {
+        name: Parameter("µm", -0.5, 0.5, 0.05)
+        for name in (
+            *("shift_y_um", "y_by_y_um", "y_by_x_um", "shift_x_um", "x_by_y_um", "x_by_x_um"),
+            *(f"{axis}_by_{power}_um" for axis in ("y", "x") for power in ("yy", "xy", "xx")),
+        )
+    },
+    source="error of the lateral map from scan to layout, affine and quadratic",
+    separating="alignment marks in every field",
+    per_scan=True,
+)
 def registration_residual(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H(x + u), u a shift and a linear and quadratic distortion left by the registration of one scan."""
     y, x = context.scan_position()
@@ -45,6 +69,13 @@ def registration_residual(height: Tensor, values: Values, context: FieldContext)
     return add_warp(height, shift_y, shift_x, context.pitch_um)
 
 
+@of_microscope(
+    "scanner running unevenly along a line",
+    {"strength": Parameter("1", -0.05, 0.05, 0.005)},
+    source="hysteresis of a piezo scanner, quadratic along the line",
+    separating="scan a calibration grating; scan at 0 and 180 degrees",
+    reverses=("strength",),
+)
 def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: its x axis runs fast in the middle of a line.
 
@@ -55,6 +86,12 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     return add_warp(height, 0 * y, values["strength"] * length_um / 4 * (1 / 3 - x**2), context.pitch_um)
 
 
+@of_microscope(
+    "blur of the finished scan",
+    {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025, tried=(0.0025, 0.04))},
+    source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
+    separating="register with two interpolation kernels; scan with half the pixel size",
+)
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass.
 
@@ -62,60 +99,3 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
-
-
-EFFECTS = (
-    of_microscope(
-        name="feedback-lag",
-        title="probe lagging behind the surface along the fast axis",
-        parameters={
-            "length_um": Parameter("µm", 0.0, 1.5, 0.2),
-            "rising": Parameter("1", 0.0, 1.0, 0.5, kind="shape"),
-            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
-        },
-        apply=feedback_lag,
-        trials=tuple(
-            {"length_um": length, "rising": rising, "direction": sign}
-            for length in (0.15, 0.4)
-            for rising in (1.0, 0.4)
-            for sign in (1.0, -1.0)
-        ),
-        source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
-        separating="compare trace and retrace; scan at 0 and 90 degrees",
-        reverses=("direction",),
-    ),
-    of_microscope(
-        name="registration-residual",
-        title="shift and distortion left by the registration",
-        parameters={
-            name: Parameter("µm", -0.5, 0.5, 0.05)
-            for name in (
-                *("shift_y_um", "y_by_y_um", "y_by_x_um", "shift_x_um", "x_by_y_um", "x_by_x_um"),
-                *(f"{axis}_by_{power}_um" for axis in ("y", "x") for power in ("yy", "xy", "xx")),
-            )
-        },
-        apply=registration_residual,
-        source="error of the lateral map from scan to layout, affine and quadratic",
-        separating="alignment marks in every field",
-        per_scan=True,
-    ),
-    of_microscope(
-        name="piezo-nonlinearity",
-        title="scanner running unevenly along a line",
-        parameters={"strength": Parameter("1", -0.05, 0.05, 0.005)},
-        apply=piezo_nonlinearity,
-        trials=({"strength": 0.005},),
-        source="hysteresis of a piezo scanner, quadratic along the line",
-        separating="scan a calibration grating; scan at 0 and 180 degrees",
-        reverses=("strength",),
-    ),
-    of_microscope(
-        name="resampling-blur",
-        title="blur of the finished scan",
-        parameters={"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025)},
-        apply=resampling_blur,
-        trials=({"variance_um2": 0.0025}, {"variance_um2": 0.04}),
-        source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
-        separating="register with two interpolation kernels; scan with half the pixel size",
-    ),
-)

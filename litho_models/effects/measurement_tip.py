@@ -17,6 +17,23 @@ _SHARPEST_UM = 1e-3
 _SHARPER = 0.25
 
 
+@of_microscope(
+    "tip of finite radius widening tops",
+    {
+        "radius_um": Parameter("µm", 0.0, 2.0, 0.04),
+        "along": Parameter("1", _SHARPER, 1.0, 1.0, "choice"),
+        "across": Parameter("1", _SHARPER, 1.0, 1.0, "choice"),
+    },
+    trials=(
+        {"radius_um": 0.04},
+        {"radius_um": 0.4},
+        {"radius_um": 0.4, "across": _SHARPER},
+        {"radius_um": 0.4, "along": _SHARPER},
+    ),
+    source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
+    separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
+    of_tip=True,
+)
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """max over u of H(x - u) - u² / 2R, the path of a paraboloid; H + R |grad H|² / 2 to first order.
 
@@ -84,26 +101,3 @@ def _next(rows: Tensor) -> Tensor:
 
 def _continued(rows: Tensor, by_px: int, mode: str) -> Tensor:
     return functional.pad(rows, (by_px, by_px, 0, 0), mode=mode)
-
-
-EFFECTS = (
-    of_microscope(
-        name="tip-dilation",
-        title="tip of finite radius widening tops",
-        parameters={
-            "radius_um": Parameter("µm", 0.0, 2.0, 0.04),
-            "along": Parameter("1", _SHARPER, 1.0, 1.0, kind="choice"),
-            "across": Parameter("1", _SHARPER, 1.0, 1.0, kind="choice"),
-        },
-        apply=tip_dilation,
-        trials=(
-            {"radius_um": 0.04},
-            {"radius_um": 0.4},
-            {"radius_um": 0.4, "across": _SHARPER},
-            {"radius_um": 0.4, "along": _SHARPER},
-        ),
-        source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
-        separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
-        of_tip=True,
-    ),
-)

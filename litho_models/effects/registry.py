@@ -20,53 +20,6 @@ from litho_models.effects import (
 from litho_models.effects.effect import Effect, Stage
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 
-_FORWARD_ORDER = (
-    "layer-stacking",
-    "line-shortening",
-    "dose-exponent",
-    "elliptical-psf",
-    "galvo-lag",
-    "galvo-nonlinearity",
-    "vignetting",
-    "laser-drift",
-    "long-range-proximity",
-    "write-order-memory",
-    "threshold-softness",
-    "diffusion-blur",
-    "height-saturation",
-    "interface-offset",
-    "field-curvature",
-    "hatch-ripple",
-    "vertical-shrinkage",
-    "dose-dependent-shrinkage",
-    "lateral-shrinkage",
-    "feature-collapse",
-    "trench-residue",
-    "slope-thinning",
-    "line-roughness",
-    "tip-dilation",
-    "feedback-lag",
-    "registration-residual",
-    "piezo-nonlinearity",
-    "resampling-blur",
-    "z-gain",
-    "datum-offset",
-    "tilt-bow",
-    "scan-line-stripes",
-    "slow-drift",
-)
-
-_FAMILIES = (
-    exposure_spot,
-    exposure_scanning,
-    exposure_field,
-    resist,
-    development,
-    measurement_height,
-    measurement_lateral,
-    measurement_tip,
-)
-
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
 UNTESTABLE = {
     "min-to-zero-datum": "an order statistic per scan; what it leaves is carried by datum-offset",
@@ -74,9 +27,45 @@ UNTESTABLE = {
     "scars-and-spikes": "a mask, not a term: looked for among the outliers",
 }
 
-TIP = "tip-dilation"
+_FORWARD_ORDER = (
+    exposure_spot.layer_stacking,
+    exposure_scanning.line_shortening,
+    exposure_spot.dose_exponent,
+    exposure_spot.elliptical_psf,
+    exposure_scanning.galvo_lag,
+    exposure_scanning.galvo_nonlinearity,
+    exposure_field.vignetting,
+    exposure_field.laser_drift,
+    exposure_spot.long_range_proximity,
+    exposure_scanning.write_order_memory,
+    resist.threshold_softness,
+    resist.diffusion_blur,
+    resist.height_saturation,
+    exposure_field.interface_offset,
+    exposure_field.field_curvature,
+    exposure_scanning.hatch_ripple,
+    development.vertical_shrinkage,
+    development.dose_dependent_shrinkage,
+    development.lateral_shrinkage,
+    development.feature_collapse,
+    development.trench_residue,
+    development.slope_thinning,
+    exposure_scanning.line_roughness,
+    measurement_tip.tip_dilation,
+    measurement_lateral.feedback_lag,
+    measurement_lateral.registration_residual,
+    measurement_lateral.piezo_nonlinearity,
+    measurement_lateral.resampling_blur,
+    measurement_height.z_gain,
+    measurement_height.datum_offset,
+    measurement_height.tilt_bow,
+    measurement_height.scan_line_stripes,
+    measurement_height.slow_drift,
+)
 
-CATALOGUE: dict[str, Effect] = {}
+TIP = measurement_tip.tip_dilation.name
+
+CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
@@ -150,14 +139,3 @@ def _tried_at(tip: Effect, radius_um: float) -> Effect:
     if any(abs(radius_um - one) < 0.2 * one for one in known):
         return tip
     return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))
-
-
-def _fill() -> None:
-    """The built-in effects in the order in which they act; one without a place in it is last of its stage."""
-    found = {effect.name: effect for family in _FAMILIES for effect in family.EFFECTS}
-    CATALOGUE.update((name, found.pop(name)) for name in _FORWARD_ORDER)
-    for effect in found.values():
-        register_effect(effect)
-
-
-_fill()
