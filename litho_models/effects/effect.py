@@ -170,7 +170,6 @@ class Effect:
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
         per_scan: its parameters belong to one scan and have no value shared by all.
-        along_lines: it depends on the line alone, so offsets of single lines would hide it.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
         knowledge: a cause has a name; a law only a formula; a description only a covariate.
@@ -186,9 +185,8 @@ class Effect:
     source: str
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
-    needs: tuple[Literal["order", "levels"], ...] = ()
+    needs: tuple[Literal["order"], ...] = ()
     per_scan: bool = False
-    along_lines: bool = False
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
     knowledge: Knowledge = "cause"

@@ -109,7 +109,6 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     acts_on="height",
     source="ripples of the paper's noise figure, at 0.1 µm pitch",
     separating="rescan at 25 nm per pixel",
-    along_lines=True,
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
