@@ -19,20 +19,19 @@ from litho_models.loop.prepared import PreparedScan
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
     """Each twin fitted from where it stands, and from the base's numbers of the best one."""
-    own = twins[0].own
 
-    def fitted(twin: Twin, start: np.ndarray) -> LeastSquaresFit:
-        return fit_least_squares(TwinProblem(twin, windows), start, RULES)
+    def fitted(twin: Twin) -> LeastSquaresFit:
+        return fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)
 
     def squares(fit: LeastSquaresFit) -> float:
         return eliminated_sum(fit.linear, RULES.term_weight)[2]
 
-    fits = [fitted(twin, twin.vector) for twin in twins]
+    fits = [fitted(twin) for twin in twins]
     best = min(fits, key=squares)
-    if not own:
-        return fits
-    again = [
-        fit if fit is best else fitted(twin, np.concatenate([best.vector[:own], fit.vector[own:]]))
+    base = best.vector[: twins[0].own]
+    return [
+        fit
+        if fit is best or not len(base)
+        else min(fit, fitted(twin.at(np.concatenate([base, fit.vector[len(base) :]]))), key=squares)
         for twin, fit in zip(twins, fits, strict=True)
     ]
-    return [min(pair, key=squares) for pair in zip(fits, again, strict=True)]

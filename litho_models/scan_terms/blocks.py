@@ -30,23 +30,13 @@ class Blocks(NamedTuple):
         buffer_px: pixels to fit on are farther than this from every pixel scored. One residual correlation
             length of the measured prints: about 0.5 at 5 px.
         line_gap_px: the same for offsets of lines, along the line.
-        border_px: pixels along the edge of a scan that are neither fitted on nor scored.
         seed: moves the origin of the checkerboard.
     """
 
     block_px: int = 32
     buffer_px: int = 7
     line_gap_px: int = 32
-    border_px: int = 0
     seed: int = 0
-
-    def inside(self, usable: BoolMap) -> BoolMap:
-        """The usable pixels without those of the border."""
-        if not self.border_px:
-            return usable
-        inner = np.zeros_like(usable)
-        inner[self.border_px : -self.border_px, self.border_px : -self.border_px] = True
-        return usable & inner
 
 
 class Half(NamedTuple):
@@ -92,17 +82,18 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
     """
     sides: dict[int, list[tuple[BoolMap, BoolMap]]] = {}
     for axis in sorted(set(axes)):
-        length = shape[axis]
-        at, middle = np.arange(length), length // 2
-        first, second = at < middle, at >= middle
-        beyond, before = at >= middle + gap_px, at < middle - gap_px
-        spread = [
-            (np.broadcast_to(np.expand_dims(part, 1 - axis), shape) for part in pair)
-            for pair in ((first, beyond), (second, before))
-        ]
-        sides[axis] = [(own, other) for own, other in spread]
-    cells = []
-    for choice in product(*sides.values()):
-        score = np.logical_and.reduce([own for own, _ in choice])
-        cells.append(Cell(score, dict(zip(sides, (other for _, other in choice), strict=True))))
-    return cells
+        at, middle = np.arange(shape[axis]), shape[axis] // 2
+        pairs = (at < middle, at >= middle + gap_px), (at >= middle, at < middle - gap_px)
+        # Each a map of the whole scan.
+        own, other = (
+            [np.broadcast_to(np.expand_dims(part, 1 - axis), shape) for part in parts]
+            for parts in zip(*pairs, strict=True)
+        )
+        sides[axis] = [*zip(own, other, strict=True)]
+    return [
+        Cell(
+            np.logical_and.reduce([own for own, _ in choice]),
+            {axis: other for axis, (_, other) in zip(sides, choice, strict=True)},
+        )
+        for choice in product(*sides.values())
+    ]
