@@ -70,13 +70,11 @@ class FieldContext:
         order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
         scan_shape: (rows, columns) of the whole scan where this field is a part of it.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        scan_line: index of the scan line under each pixel (y, x), None for the rows of the array.
         quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
         backward: the scan lines were recorded on the way back.
         new_tip: scanned with another tip than the rest, a sharp one.
         pixel_size: of the scan, relative to the rest: what lags in time goes with it.
         dose: of the print, relative to the recipe's; ``layout_um`` holds it already.
-        seed: decides the draws of random effects where one is planted.
     """
 
     layout_um: Tensor
@@ -89,8 +87,6 @@ class FieldContext:
     order: float = 0.0
     scan_shape: tuple[int, int] | None = None
     origin_px: tuple[int, int] = (0, 0)
-    scan_line: Tensor | None = None
-    seed: int = 0
     quarter_turns: int = 0
     backward: bool = False
     new_tip: bool = False
@@ -110,7 +106,6 @@ class FieldContext:
             layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),
             scan_shape=whole[::-1] if turn % 2 else whole,
             origin_px=corners[turn],
-            scan_line=None if self.scan_line is None else torch.rot90(self.scan_line, turn),
             quarter_turns=0,
         )
 
@@ -142,15 +137,13 @@ class FieldContext:
             return self.field_radius_um
         return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
 
-    def line(self) -> Tensor:
-        """Scan line of each pixel from 0, shape (y, x)."""
-        if self.scan_line is not None:
-            return self.scan_line
-        ny, nx = self.layout_um.shape[-2:]
-        return torch.arange(ny, device=self.layout_um.device)[:, None].expand(ny, nx)
-
 
 Apply = Callable[[Tensor, Values, FieldContext], Tensor]
+
+
+def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The formula of an effect that has none: each scan has its own, which its scan terms fit."""
+    raise InputError("an effect in a model", got="one of single scans", wanted="one value for all scans")
 
 
 @dataclass(frozen=True)
@@ -163,13 +156,13 @@ class Effect:
         stage, role: where it happens; whether it may enter the exported process model.
         acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
         parameters: name to ``Parameter``; at least one amplitude.
-        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm.
+        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm;
+            ``of_single_scans`` for what scan terms fit.
         trials: parameter sets (those not named are off) at which screening takes the secant
             direction; by default one amplitude at a time, at each of its values to be tried, in each shape.
         source: where the formula comes from.
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
-        per_scan: its parameters belong to one scan and have no value shared by all.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
         knowledge: a cause has a name; a law only a formula; a description only a covariate.
@@ -186,7 +179,6 @@ class Effect:
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
     needs: tuple[Literal["order"], ...] = ()
-    per_scan: bool = False
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
     knowledge: Knowledge = "cause"
@@ -199,6 +191,11 @@ class Effect:
         object.__setattr__(self, "amplitudes", amplitudes)
         if not (self.trials or self.per_scan):
             object.__setattr__(self, "trials", tuple(self._trials()))
+
+    @property
+    def per_scan(self) -> bool:
+        """Whether its parameters belong to one scan and have no value shared by all."""
+        return self.apply is of_single_scans
 
     def _trials(self) -> Iterator[dict[str, float]]:
         shapes = {n: p.tried for n, p in self.parameters.items() if n not in self.amplitudes and p.tried}

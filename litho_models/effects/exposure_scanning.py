@@ -120,19 +120,3 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)
     ripple = values["cosine_um"] * torch.cos(phase) + values["sine_um"] * torch.sin(phase)
     return height + (context.layout_um > 0).to(height.dtype) * ripple
-
-
-@of_exposure(
-    "height of the single written line",
-    {"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
-    role="nuisance",
-    acts_on="height",
-    source="arXiv:2309.17343, line-like noise along the hatching; random, so no model predicts it",
-    separating="scan the same field at 0 and 90 degrees",
-    per_scan=True,
-)
-def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + s_i, s_i ~ N(0, σ²) for each row i of the layout, drawn anew for every print."""
-    generator = torch.Generator().manual_seed(context.seed)
-    draws = torch.randn(height.shape[-2], generator=generator).to(height)
-    return height + values["sd_um"] * draws[:, None]

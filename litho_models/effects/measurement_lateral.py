@@ -46,30 +46,6 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 @of_microscope(
-    "shift and distortion left by the registration",
-    {
-        name: Parameter("µm", -0.5, 0.5, 0.05)
-        for name in (
-            *("shift_y_um", "y_by_y_um", "y_by_x_um", "shift_x_um", "x_by_y_um", "x_by_x_um"),
-            *(f"{axis}_by_{power}_um" for axis in ("y", "x") for power in ("yy", "xy", "xx")),
-        )
-    },
-    source="error of the lateral map from scan to layout, affine and quadratic",
-    separating="alignment marks in every field",
-    per_scan=True,
-)
-def registration_residual(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + u), u a shift and a linear and quadratic distortion left by the registration of one scan."""
-    y, x = context.scan_position()
-    powers = {"y": y, "x": x, "yy": y * y, "xy": x * y, "xx": x * x}
-    shift_y, shift_x = (
-        values[f"shift_{axis}_um"] + sum(values[f"{axis}_by_{power}_um"] * by for power, by in powers.items())
-        for axis in ("y", "x")
-    )
-    return add_warp(height, shift_y, shift_x, context.pitch_um)
-
-
-@of_microscope(
     "scanner running unevenly along a line",
     {"strength": Parameter("1", -0.05, 0.05, 0.005)},
     source="hysteresis of a piezo scanner, quadratic along the line",

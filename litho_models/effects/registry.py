@@ -12,10 +12,10 @@ from litho_models.effects import (
     exposure_field,
     exposure_scanning,
     exposure_spot,
-    measurement_height,
     measurement_lateral,
     measurement_tip,
     resist,
+    single_scans,
 )
 from litho_models.effects.effect import Effect, Stage
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
@@ -27,7 +27,9 @@ UNTESTABLE = {
     "scars-and-spikes": "a mask, not a term: looked for among the outliers",
 }
 
+# Those of single scans act in no model.
 _FORWARD_ORDER = (
+    *single_scans.EFFECTS,
     exposure_spot.layer_stacking,
     exposure_scanning.line_shortening,
     exposure_spot.dose_exponent,
@@ -50,17 +52,10 @@ _FORWARD_ORDER = (
     development.feature_collapse,
     development.trench_residue,
     development.slope_thinning,
-    exposure_scanning.line_roughness,
     measurement_tip.tip_dilation,
     measurement_lateral.feedback_lag,
-    measurement_lateral.registration_residual,
     measurement_lateral.piezo_nonlinearity,
     measurement_lateral.resampling_blur,
-    measurement_height.z_gain,
-    measurement_height.datum_offset,
-    measurement_height.tilt_bow,
-    measurement_height.scan_line_stripes,
-    measurement_height.slow_drift,
 )
 
 TIP = measurement_tip.tip_dilation.name
@@ -72,8 +67,8 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     """Add an effect to the catalogue; returns it. From then on it is a candidate of the loop.
 
     Args:
-        effect: the effect; one of single scans (``per_scan``) needs a scan term as well, see
-            ``litho_models.scan_terms.register_scan_term``.
+        effect: the effect; one of single scans (``apply`` is ``of_single_scans``) needs a scan term as well,
+            see ``litho_models.scan_terms.register_scan_term``.
         after: the effect behind which it acts; by default it is the last one of its stage.
 
     Raises:
