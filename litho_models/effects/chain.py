@@ -42,7 +42,6 @@ class EffectChain(nn.Module):
         self.scan_frame = frozenset(scan_frame)
         self.print_frame = frozenset(print_frame)
         self.names = tuple(in_forward_order(list(effects)))
-        self.fitted: list[tuple[str, str]] = []
         for name in self.names:
             effect = get_effect(name)
             for parameter, value in effect.with_values(effects[name]).items():
@@ -51,7 +50,6 @@ class EffectChain(nn.Module):
                     self.register_buffer(_key(name, parameter), tensor)
                 else:
                     self.register_parameter(_key(name, parameter), nn.Parameter(tensor))
-                    self.fitted.append((name, parameter))
 
     @property
     def tile(self) -> Tile | None:

@@ -29,20 +29,18 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     with 1 the probe is a linear filter, below 1 it parachutes off falling edges. The delay is one of time:
     with smaller pixels it is shorter.
     """
-    length = values["length_um"] * context.pixel_size
+    length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
-    forward = float(values["direction"]) > 0
-    gains = [1 / (1 + part / context.pitch_um) for part in (rising, length)]
-    columns = (height if forward else height.flip(-1)).unbind(-1)
-    followed = [columns[0]]
-    for column in columns[1:]:
+    forward = 1 if values["direction"] > 0 else -1
+    up, down = 1 / (1 + rising / pitch), 1 / (1 + length / pitch)
+    first, *columns = height.unbind(-1)[::forward]
+    followed = [first]
+    for column in columns:
         error = column - followed[-1]
-        followed.append(followed[-1] + torch.where(error > 0, gains[0], gains[1]) * error)
-    late = torch.stack(followed, dim=-1)
-    delay = (length + rising) / 2
-    return add_warp(
-        late if forward else late.flip(-1), 0 * delay, delay if forward else -delay, context.pitch_um
-    )
+        followed.append(followed[-1] + torch.where(error > 0, up, down) * error)
+    late = torch.stack(followed[::forward], dim=-1)
+    delay = forward * (length + rising) / 2
+    return add_warp(late, 0 * delay, delay, pitch)
 
 
 @of_microscope(

@@ -88,10 +88,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
 
 def _middles(rows: Tensor) -> Tensor:
     """Values (..., x) half a pixel to the right of each: the cubic through four neighbours."""
-    size = rows.shape[-1]
     padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
-    shifted = [padded[..., start : start + size] for start in range(len(_MIDDLE))]
-    middles = torch.tensordot(rows.new_tensor(_MIDDLE), torch.stack(shifted), dims=1)
+    middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)
     return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)
 
 
