@@ -86,16 +86,10 @@ def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: fl
         shift_y_um, shift_x_um: maps (y, x) or numbers, µm.
     """
     ny, nx = field.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(ny, dtype=field.dtype, device=field.device),
-        torch.arange(nx, dtype=field.dtype, device=field.device),
-        indexing="ij",
-    )
-    return (
-        field
-        + _look_up(field, y + shift_y_um / pitch_um, x + shift_x_um / pitch_um)
-        - _look_up(field, y + 0 * shift_y_um, x + 0 * shift_x_um)
-    )
+    y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in (ny, nx))
+    rows, columns = y[:, None], x[None, :]
+    moved = _look_up(field, rows + shift_y_um / pitch_um, columns + shift_x_um / pitch_um)
+    return field + moved - _look_up(field, rows, columns)
 
 
 def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:

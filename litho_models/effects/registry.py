@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.effects import (
@@ -17,7 +16,7 @@ from litho_models.effects import (
     resist,
     single_scans,
 )
-from litho_models.effects.effect import Effect, Stage
+from litho_models.effects.effect import Effect
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
@@ -104,12 +103,9 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
         InputError: a name that is no effect's.
     """
     given = {get_effect(name).name for name in names}
-    stages = list(get_args(Stage))
+    known = {**CATALOGUE, **LAWS, **DESCRIPTIONS}
     # What has no name acts on the finished print, before the microscope sees it.
-    print_ends = max(i for i, one in enumerate(CATALOGUE.values()) if one.stage != stages[-1])
-    known = list(CATALOGUE)
-    nameless = [name for name in (*LAWS, *DESCRIPTIONS) if name in given]
-    ordered = [*known[: print_ends + 1], *nameless, *known[print_ends + 1 :]]
+    ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
     return [name for name in ordered if name in given]
 
 
@@ -120,10 +116,10 @@ def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
         tip_radius_um: of the microscope's tip, or the most that it can be, if the store knows it: the tip is
             tried at that size too.
     """
-    effects = [effect for effect in CATALOGUE.values() if not effect.per_scan]
-    if tip_radius_um is None:
-        return effects
-    return [_tried_at(effect, tip_radius_um) if effect.name == TIP else effect for effect in effects]
+    effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
+    if tip_radius_um is not None:
+        effects[TIP] = _tried_at(effects[TIP], tip_radius_um)
+    return [*effects.values()]
 
 
 def _tried_at(tip: Effect, radius_um: float) -> Effect:

@@ -41,20 +41,15 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """The model; ``bare``: its base alone."""
+        """The model, in which an effect goes with the print or with the scan; ``bare``: its base alone."""
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
-        return framed(bare.at(np.array(self.vector)), self.effect, self.owner)
-
-
-def framed(twin: Twin, effect: str, owner: Owner | None) -> Twin:
-    """A model in which an effect goes with the print, or with the scan."""
-    own = frozenset([effect])
-    return replace(
-        twin,
-        scan_frame=own if owner == "microscope" else frozenset(),
-        print_frame=own if owner == "printer" else frozenset(),
-    )
+        own = frozenset([self.effect])
+        return replace(
+            bare.at(np.array(self.vector)),
+            scan_frame=own if self.owner == "microscope" else frozenset(),
+            print_frame=own if self.owner == "printer" else frozenset(),
+        )
 
 
 class Question(Record):

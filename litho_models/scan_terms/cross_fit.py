@@ -124,7 +124,7 @@ def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, te
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Coefficients (k,) of ``design`` (k, n) that come closest to ``target`` (n,); smallest if not unique."""
+    """Coefficients (k, …) of ``design`` (k, n) that come closest to ``target`` (n, …)."""
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 
 

@@ -23,6 +23,7 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
 from litho_models.scan_terms.background import field_um, is_of_size
+from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL, groupings, label_of
 from litho_models.scan_terms.term import FloatMap
@@ -206,18 +207,18 @@ class _Learner:
         fold_of = _deal(self._ids, seed)
         chosen: list[_Offer] = []
         left = self._products.held_out([], fold_of)
-        while True:
-            best, best_left = None, left
-            for offer in self._offers(chosen):
-                now = self._products.held_out([block for *_, block in (*chosen, offer)], fold_of)
-                if now.mean() < best_left.mean():
-                    best, best_left = offer, now
-            gain = left - best_left
+        while offers := self._offers(chosen):
+            tried = [
+                self._products.held_out([block for *_, block in (*chosen, one)], fold_of) for one in offers
+            ]
+            best = int(np.argmin([one.mean() for one in tried]))
+            gain = left - tried[best]
             error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-            if best is None or gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
-                return chosen
-            chosen.append(best)
-            left = best_left
+            if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
+                break
+            chosen.append(offers[best])
+            left = tried[best]
+        return chosen
 
     def fitted(self, chosen: Sequence[_Offer]) -> list[SharedPart]:
         """The parts with their strengths."""
@@ -260,7 +261,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
     # A background is added after the levelling, so that it is not levelled itself.
     surface = shapes[[0, *LEVELLED[model.levelling]]]
-    moved -= np.linalg.solve(surface @ surface.T, surface @ moved.T).T @ surface
+    moved -= least_squares(surface, moved.T).T @ surface
     rows = np.concatenate([residual[None], shapes[1:], moved])
     for part in model.parts:
         if known := part.of(scan):
@@ -291,7 +292,7 @@ def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levellin
             at = _thinned(scan.usable)
             rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
             shapes = _polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at]
-            rests.append(np.linalg.lstsq(shapes @ shapes.T, shapes @ rest, rcond=None)[0])
+            rests.append(least_squares(shapes, rest))
         # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
         weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
         errors[name] = float((np.var(rests, axis=0) * weights)[1:].sum())
@@ -317,8 +318,7 @@ def _levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Fl
         return field
     shapes = _polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
     basis = shapes[:, usable]
-    fitted = np.linalg.solve(basis @ basis.T, basis @ field[usable])
-    surface = np.tensordot(fitted[1:], shapes[1:], axes=1)
+    surface = np.tensordot(least_squares(basis, field[usable])[1:], shapes[1:], axes=1)
     return field - surface + surface[usable].mean()
 
 

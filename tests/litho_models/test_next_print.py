@@ -614,7 +614,7 @@ def test_a_question_below_the_models_own_error_is_declared_before_printing(
     def asked(form_nm: float | None) -> PlannedQuestion:
         question = slope_question(form_nm=form_nm)
         own = Rivalry(question, base_model(), rivalry.printing, rivalry.noise)
-        return of_rivals(own, prints, prints, {}, 4)
+        return of_rivals(own, {}, prints, prints, 4)
 
     plain = asked(None)
     assert plain.status == "decides"
