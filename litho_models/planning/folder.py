@@ -32,6 +32,13 @@ _COLUMNS = (
     *("id", "order", "field_x_um", "field_y_um", "dose", "use"),
     *("turned_deg", "direction", "tip", "pixel_size"),
 )
+_REFERENCES = {
+    "substrate": "zero, tilt and bow without a print",
+    "flat": "the noise floor",
+    "steps": "height against level; the microscope's gain on a step standard",
+    "grating": "scales and unevenness of the scanner, and the tip",
+}
+# What the printer makes of them.
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -57,19 +64,12 @@ def schedule(
     unprinted = flat((size_px, size_px), level=0)
     middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
     plain = PlannedPrint(planned[0].level, ())
-    rows: list[tuple[Use, int, int, np.ndarray, PlannedPrint, Way, str]] = [
-        ("substrate", 0, 1, unprinted, plain, Way(), "zero, tilt and bow without a print"),
-        ("flat", 0, 2, middle, plain, Way(), "the noise floor"),
-        (
-            "steps",
-            0,
-            3,
-            ladder,
-            plain,
-            Way(),
-            "height against level; the microscope's gain on a step standard",
-        ),
-        ("grating", 0, 4, unprinted, plain, Way(), "scales and unevenness of the scanner, and the tip"),
+    references: dict[Use, np.ndarray] = {
+        "substrate": unprinted, "flat": middle, "steps": ladder, "grating": unprinted,
+    }  # fmt: skip
+    rows = [
+        (use, 0, at, level, plain, Way(), _REFERENCES[use])
+        for at, (use, level) in enumerate(references.items(), start=1)
     ]
     for number, one in enumerate(planned, start=1):
         level = one.level.numpy().astype(np.uint8)

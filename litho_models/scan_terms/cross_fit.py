@@ -76,9 +76,6 @@ def cross_fit(
         raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="none")
     difference = np.where(usable, height - prediction, 0.0)
     residual = np.full(height.shape, np.nan)
-    if not terms:
-        residual[usable] = difference[usable]
-        return CrossFit(residual, 0.0, 0.0)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
     lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines is not None]
     axes = [axis_along(line) for line in lines]

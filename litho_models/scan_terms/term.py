@@ -92,7 +92,7 @@ def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
     """The smooth maps of some terms, in the order of the catalogue: (k, n)."""
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
     count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
-    return np.concatenate(chosen) if chosen else np.empty((0, count))
+    return np.concatenate([np.empty((0, count)), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:

@@ -46,9 +46,8 @@ from litho_models.planning.layouts import Limits, as_tensor, climb, score, start
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question, open_questions
 from litho_models.planning.power import Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
+from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals
 from litho_models.planning.record import NextPrint, PlannedQuestion
-from litho_models.planning.rival_fits import fit_rivals
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
