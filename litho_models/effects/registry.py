@@ -6,16 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from litho_data.foundation.errors import InputError, require_known
-from litho_models.effects import (
-    development,
-    exposure_field,
-    exposure_scanning,
-    exposure_spot,
-    measurement_lateral,
-    measurement_tip,
-    resist,
-    single_scans,
-)
+from litho_models.effects import exposure_spot, exposure_writing, measurement, resist, single_scans
 from litho_models.effects.effect import Effect
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 
@@ -30,34 +21,34 @@ UNTESTABLE = {
 _FORWARD_ORDER = (
     *single_scans.EFFECTS,
     exposure_spot.layer_stacking,
-    exposure_scanning.line_shortening,
+    exposure_writing.line_shortening,
     exposure_spot.dose_exponent,
     exposure_spot.elliptical_psf,
-    exposure_scanning.galvo_lag,
-    exposure_scanning.galvo_nonlinearity,
-    exposure_field.vignetting,
-    exposure_field.laser_drift,
+    exposure_writing.galvo_lag,
+    exposure_writing.galvo_nonlinearity,
+    exposure_writing.vignetting,
+    exposure_writing.laser_drift,
     exposure_spot.long_range_proximity,
-    exposure_scanning.write_order_memory,
+    exposure_writing.write_order_memory,
     resist.threshold_softness,
     resist.diffusion_blur,
     resist.height_saturation,
-    exposure_field.interface_offset,
-    exposure_field.field_curvature,
-    exposure_scanning.hatch_ripple,
-    development.vertical_shrinkage,
-    development.dose_dependent_shrinkage,
-    development.lateral_shrinkage,
-    development.feature_collapse,
-    development.trench_residue,
-    development.slope_thinning,
-    measurement_tip.tip_dilation,
-    measurement_lateral.feedback_lag,
-    measurement_lateral.piezo_nonlinearity,
-    measurement_lateral.resampling_blur,
+    exposure_writing.interface_offset,
+    exposure_writing.field_curvature,
+    exposure_writing.hatch_ripple,
+    resist.vertical_shrinkage,
+    resist.dose_dependent_shrinkage,
+    resist.lateral_shrinkage,
+    resist.feature_collapse,
+    resist.trench_residue,
+    resist.slope_thinning,
+    measurement.tip_dilation,
+    measurement.feedback_lag,
+    measurement.piezo_nonlinearity,
+    measurement.resampling_blur,
 )
 
-TIP = measurement_tip.tip_dilation.name
+TIP = measurement.tip_dilation.name
 
 CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
 
