@@ -90,12 +90,12 @@ class Printing:
         """What effects know of a planned scan."""
         reach_um = self.reach_um(printed)
         return FieldContext(
-            layout_um=layout_um,
-            pitch_um=self.pitch_um,
-            full_height_um=self.full_height_um,
-            slice_um=self.level_height_um,
-            field_centre_um=(reach_um, reach_um),
-            field_radius_um=None if self.write_field_um is None else self.write_field_um / 2,
+            layout_um,
+            self.pitch_um,
+            self.full_height_um,
+            self.level_height_um,
+            (reach_um, reach_um),
+            None if self.write_field_um is None else self.write_field_um / 2,
             order=printed.order,
             quarter_turns=way.turned_deg // 90,
             backward=way.direction < 0,

@@ -80,20 +80,13 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
         axes: axes that lines run along, 1 for lines along x.
         gap_px: pixels along a line between a scored pixel and those its offset comes from, at least.
     """
-    sides: dict[int, list[tuple[BoolMap, BoolMap]]] = {}
-    for axis in sorted(set(axes)):
-        at, middle = np.arange(shape[axis]), shape[axis] // 2
-        pairs = (at < middle, at >= middle + gap_px), (at >= middle, at < middle - gap_px)
-        # Each a map of the whole scan.
-        own, other = (
-            [np.broadcast_to(np.expand_dims(part, 1 - axis), shape) for part in parts]
-            for parts in zip(*pairs, strict=True)
-        )
-        sides[axis] = [*zip(own, other, strict=True)]
-    return [
-        Cell(
-            np.logical_and.reduce([own for own, _ in choice]),
-            {axis: other for axis, (_, other) in zip(sides, choice, strict=True)},
-        )
-        for choice in product(*sides.values())
-    ]
+    axes, cells = sorted(set(axes)), []
+    for sides in product((False, True), repeat=len(axes)):
+        score, other_side = np.ones(shape, bool), {}
+        for axis, second in zip(axes, sides, strict=True):
+            at, middle = np.expand_dims(np.arange(shape[axis]), 1 - axis), shape[axis] // 2
+            score &= (at >= middle) == second
+            beyond = at < middle - gap_px if second else at >= middle + gap_px
+            other_side[axis] = np.broadcast_to(beyond, shape)
+        cells.append(Cell(score, other_side))
+    return cells

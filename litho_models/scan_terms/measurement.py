@@ -9,7 +9,7 @@ printer: no design sees it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
@@ -179,71 +179,65 @@ def learn_measurement(
     model = model.model_copy(update={"levelling": _best_levelling(pairs, model), "scans": len(pairs)})
     chosen: list[_Offer] = []
     for _ in range(_ROUNDS):
-        learner = _Learner(pairs, model)
-        chosen = chosen or learner.choose(seed)
-        model = model.model_copy(update={"parts": learner.fitted(chosen)})
+        products = _products(pairs, model)
+        chosen = chosen or _chosen(products, _deal([scan.id for scan, _ in pairs], seed))
+        model = model.model_copy(update={"parts": _fitted(products, chosen)})
         if not chosen:
             break
     return model
 
 
-class _Learner:
+def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
     """Inner products of what could be shared, at a model of the measurement so far."""
+    grams = []
+    for scan, prediction in pairs:
+        rows = _rows(scan, prediction, model)
+        grams.append(rows @ rows.T / rows.shape[1])
+    return Products(np.stack(grams), groupings([scan for scan, _ in pairs], by_order=False))
 
-    def __init__(self, pairs: Sequence[_Pair], model: MeasurementModel):
-        scans = [scan for scan, _ in pairs]
-        self._groups = groupings(scans, by_order=False)
-        self._ids = [scan.id for scan in scans]
-        grams = []
-        for scan, prediction in pairs:
-            rows = _rows(scan, prediction, model)
-            grams.append(rows @ rows.T / rows.shape[1])
-        self._products = Products(np.stack(grams), self._groups)
 
-    def choose(self, seed: int) -> list[_Offer]:
-        """What to add, beginning with nothing."""
-        if len(self._ids) < 2:
-            return []
-        fold_of = _deal(self._ids, seed)
-        chosen: list[_Offer] = []
-        left = self._products.held_out([], fold_of)
-        while offers := self._offers(chosen):
-            tried = [
-                self._products.held_out([block for *_, block in (*chosen, one)], fold_of) for one in offers
-            ]
-            best = int(np.argmin([one.mean() for one in tried]))
-            gain = left - tried[best]
-            error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-            if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
-                break
-            chosen.append(offers[best])
-            left = tried[best]
+def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
+    """What to add, beginning with nothing; ``fold_of``: (scans,)."""
+    chosen: list[_Offer] = []
+    if len(fold_of) < 2:
         return chosen
+    left = products.held_out([], fold_of)
+    while offers := _offers(products.groups, chosen):
+        tried = [products.held_out([block for *_, block in (*chosen, one)], fold_of) for one in offers]
+        best = int(np.argmin([one.mean() for one in tried]))
+        gain = left - tried[best]
+        error = gain.std(ddof=1) / np.sqrt(len(gain))
+        if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
+            break
+        chosen.append(offers[best])
+        left = tried[best]
+    return chosen
 
-    def fitted(self, chosen: Sequence[_Offer]) -> list[SharedPart]:
-        """The parts with their strengths."""
-        every = np.arange(len(self._ids))
-        fitted = self._products.strengths([block for *_, block in chosen], every)
-        return [
-            SharedPart(
-                what=what,
-                by=block.by,
-                degree=degree,
-                shrinking=block.shrinking,
-                coefficients={label: own.tolist() for label, own in strengths.items()},
-            )
-            for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
-        ]
 
-    def _offers(self, chosen: Sequence[_Offer]) -> list[_Offer]:
-        taken = {(what, block.by) for what, _, block in chosen}
-        found = []
-        for what, degree, grouped in _OFFERS:
-            for by in [name for name in self._groups if (name != ALL) == grouped]:
-                if (what, by) not in taken:
-                    shrinking = _SHRINKING if grouped else _SHRINKING[:1]
-                    found += [(what, degree, Block(_columns_of(what, degree), by, one)) for one in shrinking]
-        return found
+def _offers(groups: Iterable[str], chosen: Sequence[_Offer]) -> list[_Offer]:
+    taken = {(what, block.by) for what, _, block in chosen}
+    return [
+        (what, degree, Block(_columns_of(what, degree), by, shrinking))
+        for what, degree, grouped in _OFFERS
+        for by in groups
+        if (by != ALL) == grouped and (what, by) not in taken
+        for shrinking in (_SHRINKING if grouped else _SHRINKING[:1])
+    ]
+
+
+def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
+    """The parts with their strengths."""
+    fitted = products.strengths([block for *_, block in chosen], np.arange(len(products.grams)))
+    return [
+        SharedPart(
+            what=what,
+            by=block.by,
+            degree=degree,
+            shrinking=block.shrinking,
+            coefficients={label: own.tolist() for label, own in strengths.items()},
+        )
+        for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
+    ]
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
