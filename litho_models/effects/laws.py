@@ -7,20 +7,28 @@ many strengths: they follow whatever their covariate carries, and explain nothin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, trailing_response
 
 _ROUNDED_SLOPE = 1e-3
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
-_COPIES_UM = tuple((dy, dx) for dy in _STENCIL_UM for dx in _STENCIL_UM if dy or dx)
+_COPIES_UM = {
+    f"from_{1000 * dy:+.0f}_{1000 * dx:+.0f}_nm": (dy, dx)
+    for dy in _STENCIL_UM
+    for dx in _STENCIL_UM
+    if dy or dx
+}
+_KNOTS = {f"level_{knot}_of_8": knot for knot in range(9)}
+_POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
+_TURN = "print and scan the same layouts turned by 90 degrees"
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
 # (y, x) of the directions along which a slope is taken.
@@ -129,7 +137,8 @@ def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
         return height + values["strength"] * column(Surface(height, context))
 
     return Effect(
-        name=_named(name),
+        # It may be a part of the name of a parameter.
+        name=name.replace(".", "-"),
         title=f"height changed by {formula}",
         stage="development",
         role="undetermined",
@@ -138,83 +147,51 @@ def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
         apply=apply,
         source="found in the residual; h in µm, h̄ its Gaussian mean, x and y from -1 to 1 over the scan, "
         "r² = x² + y², the order t from -0.5 to 0.5",
-        separating="print and scan the same layouts turned by 90 degrees",
+        separating=_TURN,
         knowledge="law",
     )
 
 
-def _level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """One correction for each of nine heights of the layout, linear between them."""
-    share = _blurred(context.layout_um, context, 0.15) / context.full_height_um * 8
-    total = height
-    for knot in range(9):
-        total = total + values[_of_knot(knot)] * torch.relu(1 - (share - knot).abs())
-    return total
-
-
-def _linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
-    total, pitch, (ny, nx) = height, context.pitch_um, height.shape[-2:]
-    edge = round(max(_STENCIL_UM) / pitch)
-    padded = functional.pad(height, (edge,) * 4, mode="replicate")
-    for dy, dx in _COPIES_UM:
-        top, left = edge + round(dy / pitch), edge + round(dx / pitch)
-        moved = padded[..., top : top + ny, left : left + nx]
-        total = total + values[_of_copy(dy, dx)] * (moved - height)
-    return total
-
-
-def _of_knot(knot: int) -> str:
-    return f"level_{knot}_of_8"
-
-
-def _of_copy(dy_um: float, dx_um: float) -> str:
-    return f"from_{1000 * dy_um:+.0f}_{1000 * dx_um:+.0f}_nm"
-
-
-def _named(name: str) -> str:
-    """A name that may be a part of the name of a parameter."""
-    return name.replace(".", "-")
-
-
-def _place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The height times a polynomial of the place in the scan."""
-    y, x = context.scan_position()
-    factor = sum(values[f"y{i}_x{j}"] * y**i * x**j for i in range(5) for j in range(5 - i) if i + j)
-    return height * (1 + factor)
-
-
-def _description(name: str, title: str, names: list[str], unit: str, apply: Callable[..., Tensor]) -> Effect:
-    return Effect(
-        name=name,
-        title=title,
-        stage="development",
+def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Effect]:
+    return of_development(
+        title,
+        {name: Parameter(unit, -1.0, 1.0, 0.02) for name in names},
         role="undetermined",
-        acts_on="height",
-        parameters={one: Parameter(unit, -1.0, 1.0, 0.02) for one in names},
-        apply=apply,
-        trials=tuple({one: 0.02} for one in names),
         source="a table along a covariate",
-        separating="print and scan the same layouts turned by 90 degrees",
+        separating=_TURN,
         knowledge="description",
     )
 
 
+@_table("a height of its own for each level", _KNOTS, "µm")
+def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """One correction for each of nine heights of the layout, linear between them."""
+    share = _blurred(context.layout_um, context, 0.15) / context.full_height_um * 8
+    total = height
+    for name, knot in _KNOTS.items():
+        total = total + values[name] * torch.relu(1 - (share - knot).abs())
+    return total
+
+
+@_table("a response to the height nearby", _COPIES_UM, "1")
+def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
+    total, pitch, (ny, nx) = height, context.pitch_um, height.shape[-2:]
+    edge = round(max(_STENCIL_UM) / pitch)
+    padded = functional.pad(height, (edge,) * 4, mode="replicate")
+    for name, (dy, dx) in _COPIES_UM.items():
+        top, left = edge + round(dy / pitch), edge + round(dx / pitch)
+        moved = padded[..., top : top + ny, left : left + nx]
+        total = total + values[name] * (moved - height)
+    return total
+
+
+@_table("a gain that follows the place in the scan", _POWERS, "1")
+def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The height times a polynomial of the place in the scan."""
+    y, x = context.scan_position()
+    return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
+
+
 LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
-DESCRIPTIONS = {
-    one.name: one
-    for one in (
-        _description(
-            "level-table", "a height of its own for each level", [_of_knot(k) for k in range(9)], "µm",
-            _level_table,
-        ),
-        _description(
-            "linear-response", "a response to the height nearby",
-            [_of_copy(*one) for one in _COPIES_UM], "1", _linear_response,
-        ),
-        _description(
-            "place-map", "a gain that follows the place in the scan",
-            [f"y{i}_x{j}" for i in range(5) for j in range(5 - i) if i + j], "1", _place_map,
-        ),
-    )
-}  # fmt: skip
+DESCRIPTIONS = {one.name: one for one in (level_table, linear_response, place_map)}
