@@ -12,6 +12,9 @@ from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext
 
+# Slope below which a power of it is rounded off.
+_LEAST_SLOPE = 1e-3
+
 
 def add_filtered(
     field: Tensor,
@@ -76,6 +79,11 @@ def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * pitch_um)
     along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * pitch_um)
     return along_y, along_x
+
+
+def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
+    """A power of the size of a slope, zero without one, rounded off near zero so that it has a derivative."""
+    return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
 
 
 def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:

@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_models.effects.effect import Apply, Effect, FieldContext, Parameter, Values, of_development
-from litho_models.effects.filters import add_blur, add_filtered, gradient, trailing_response
+from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-_ROUNDED_SLOPE = 1e-3
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
@@ -56,7 +55,7 @@ class Surface:
     def size(self, power: float, *directions: str) -> Tensor:
         """A power of the size of a slope, or of the steepness, rounded off near zero so that it is smooth."""
         squared = torch.stack([self.slope(one) for one in directions]).square().sum(dim=0)
-        return (squared + _ROUNDED_SLOPE**2) ** (power / 2) - _ROUNDED_SLOPE**power
+        return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
         """x, y, or r² of the pixel in its scan."""

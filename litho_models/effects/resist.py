@@ -9,15 +9,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_development, of_resist
-from litho_models.effects.filters import add_blur, add_warp, dose_nearby, gradient
+from litho_models.effects.filters import add_blur, add_warp, dose_nearby, gradient, rounded_power
 
 _BLUR_REACH_UM = 4.0
 _OF_NARROW = {
     "fraction": Parameter("1", 0.0, 0.9, 0.1),
     "width_um": Parameter("µm", 0.2, 3.0, 0.5, "shape", tried=(0.4, 0.8, 1.4)),
 }
-# Slope below which a power of it is rounded off, so that it has a derivative.
-_LEAST_SLOPE = 1e-3
 
 
 @of_resist(
@@ -184,8 +182,5 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
     """
     power = values["exponent"]
-    along_y, along_x = (
-        (slope**2 + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
-        for slope in gradient(height, context.pitch_um)
-    )
+    along_y, along_x = (rounded_power(slope**2, power) for slope in gradient(height, context.pitch_um))
     return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y

@@ -278,19 +278,19 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
 
 def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levelling:
     """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
-    errors: dict[Levelling, float] = {}
-    for name in LEVELLED:
-        levelled = model.model_copy(update={"levelling": name})
+    # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
+    weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
+
+    def error(levelling: Levelling) -> float:
+        levelled = model.model_copy(update={"levelling": levelling})
         rests = []
         for scan, prediction in pairs:
             at = _thinned(scan.usable)
             rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
-            shapes = _polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at]
-            rests.append(least_squares(shapes, rest))
-        # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
-        weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
-        errors[name] = float((np.var(rests, axis=0) * weights)[1:].sum())
-    return min(errors, key=lambda name: errors[name])
+            rests.append(least_squares(_polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at], rest))
+        return float((np.var(rests, axis=0) * weights)[1:].sum())
+
+    return min(LEVELLED, key=error)
 
 
 def _displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
