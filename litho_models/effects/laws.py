@@ -22,6 +22,7 @@ Column = Callable[[Tensor, FieldContext], Tensor]
 _ROUNDED_SLOPE = 1e-3
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
+_LAST_KNOT = 16
 _COPIES_UM = tuple((dy, dx) for dy in _STENCIL_UM for dx in _STENCIL_UM if dy or dx)
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
@@ -110,6 +111,22 @@ def _beside(side: str, length_um: float) -> Column:
     return column
 
 
+def _along(direction: str, length_um: float) -> Column:
+    """Mean height along a direction, to both sides, weighted by an exponential of that length."""
+    along_y, along_x = _DIRECTIONS[direction]
+
+    def column(height: Tensor, context: FieldContext) -> Tensor:
+        length = torch.as_tensor(length_um, dtype=height.dtype, device=height.device)
+
+        def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+            # Both sides together: their phases cancel.
+            return trailing_response(along_y * fy + along_x * fx, length, context.pitch_um).real - 1
+
+        return add_filtered(height, transfer_minus_one, context.pitch_um, 6 * length_um)
+
+    return column
+
+
 def _blurred(height: Tensor, context: FieldContext, sigma_um: float) -> Tensor:
     variance = torch.as_tensor(sigma_um**2, dtype=height.dtype, device=height.device)
     return add_blur(height, variance, context.pitch_um, 4 * sigma_um)
@@ -150,6 +167,10 @@ def _columns() -> Iterator[tuple[str, str, str, Column]]:
         yield f"above-surroundings-{within}", f"(h - {mean})²", "µm²", _times(above, above)
         steps = _mean(reach, _size(1, *steepness))
         yield f"steps-within-{within}", f"mean of |∇h| within {reach:g} µm", "1", steps
+    for axis in _DIRECTIONS:
+        for length in _TAILS_UM[1:]:
+            column = _minus(_along(axis, length), _height)
+            yield f"along-{axis}-{length:g}-um", f"h along {axis} over {length:g} µm - h", "µm", column
     for side in _SIDES:
         for length in _TAILS_UM:
             column = _minus(_beside(side, length), _height)
@@ -179,28 +200,30 @@ def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
 
 
 def _level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """One correction for each of nine heights of the layout, linear between them."""
-    share = _blurred(context.layout_um, context, 0.15) / context.full_height_um * 8
-    total = height
-    for knot in range(9):
-        total = total + values[_of_knot(knot)] * torch.relu(1 - (share - knot).abs())
-    return total
+    """One correction for each of seventeen heights of the layout, linear between them."""
+    knots = torch.stack([values[_of_knot(knot)] for knot in range(_LAST_KNOT + 1)])
+    smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
+    share = (smooth / context.full_height_um * _LAST_KNOT).clamp(0, _LAST_KNOT)
+    below = share.floor().clamp(max=_LAST_KNOT - 1)
+    at = below.long()
+    return height + knots[at] + (share - below) * (knots[at + 1] - knots[at])
 
 
 def _linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
-    total, pitch, (ny, nx) = height, context.pitch_um, height.shape[-2:]
+    pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
-    for dy, dx in _COPIES_UM:
+    weights = [values[_of_copy(*one)] for one in _COPIES_UM]
+    total = height * (1 - sum(weights))
+    for (dy, dx), weight in zip(_COPIES_UM, weights, strict=True):
         top, left = edge + round(dy / pitch), edge + round(dx / pitch)
-        moved = padded[..., top : top + ny, left : left + nx]
-        total = total + values[_of_copy(dy, dx)] * (moved - height)
+        total = total + weight * padded[..., top : top + ny, left : left + nx]
     return total
 
 
 def _of_knot(knot: int) -> str:
-    return f"level_{knot}_of_8"
+    return f"level_{knot}_of_{_LAST_KNOT}"
 
 
 def _of_copy(dy_um: float, dx_um: float) -> str:
@@ -215,7 +238,8 @@ def _named(name: str) -> str:
 def _place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The height times a polynomial of the place in the scan."""
     y, x = context.scan_position()
-    factor = sum(values[f"y{i}_x{j}"] * y**i * x**j for i in range(5) for j in range(5 - i) if i + j)
+    # By columns: a polynomial of y times a power of x.
+    factor = sum(sum(values[f"y{i}_x{j}"] * y**i for i in range(5 - j) if i + j) * x**j for j in range(5))
     return height * (1 + factor)
 
 
@@ -236,12 +260,12 @@ def _description(name: str, title: str, names: list[str], unit: str, apply: Call
 
 
 LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
-DESCRIPTIONS = {
+TABLES = {
     one.name: one
     for one in (
         _description(
-            "level-table", "a height of its own for each level", [_of_knot(k) for k in range(9)], "µm",
-            _level_table,
+            "level-table", "a height of its own for each level",
+            [_of_knot(k) for k in range(_LAST_KNOT + 1)], "µm", _level_table,
         ),
         _description(
             "linear-response", "a response to the height nearby",

@@ -18,7 +18,7 @@ from litho_models.effects import (
     resist,
 )
 from litho_models.effects.effect import Effect, Stage
-from litho_models.effects.laws import DESCRIPTIONS, LAWS
+from litho_models.effects.laws import LAWS, TABLES
 
 _FORWARD_ORDER = (
     "layer-stacking",
@@ -90,7 +90,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
     """
-    if effect.name in {**CATALOGUE, **LAWS, **DESCRIPTIONS}:
+    if effect.name in {**CATALOGUE, **LAWS, **TABLES}:
         raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
     alike = [name for name, other in CATALOGUE.items() if other.stage == effect.stage]
     behind = get_effect(after).name if after else alike[-1]
@@ -107,7 +107,7 @@ def get_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
-    if (nameless := LAWS.get(name) or DESCRIPTIONS.get(name)) is not None:
+    if (nameless := LAWS.get(name) or TABLES.get(name)) is not None:
         return nameless
     require_known("effect", name, CATALOGUE)
     return CATALOGUE[name]
@@ -124,7 +124,7 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
     # What has no name acts on the finished print, before the microscope sees it.
     print_ends = max(i for i, one in enumerate(CATALOGUE.values()) if one.stage != stages[-1])
     known = list(CATALOGUE)
-    nameless = [name for name in (*LAWS, *DESCRIPTIONS) if name in given]
+    nameless = [name for name in (*LAWS, *TABLES) if name in given]
     ordered = [*known[: print_ends + 1], *nameless, *known[print_ends + 1 :]]
     return [name for name in ordered if name in given]
 
