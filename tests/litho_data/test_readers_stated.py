@@ -130,6 +130,58 @@ def test_a_caller_may_say_that_no_pixel_is_missing(tmp_path: Path) -> None:
     assert read_scan(path, unit="nm", missing=[]).height_um.min() == -9.999
 
 
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("# Height [V]", "no height channel.*V"),
+        ("# Heights in 0.1 nm", "a scale in the header.*0.1 nm"),
+        ("# Heights (x 10 nm)", "a scale in the header.*10 nm"),
+        ("# multiply by 10 to get nm", "a scale in the header.*multiply by 10"),
+        ("Units of height: microns", "unit, got 'nm', wanted 'microns'"),
+        ("# units: nm\n# z-units: um", "unit, got 'nm', wanted 'um'"),
+        (", ".join(f"h{k} (um)" for k in range(4)), "unit, got 'nm', wanted 'um'"),
+    ],
+)
+def test_what_words_say_of_the_heights_is_not_passed_over(tmp_path: Path, head: str, message: str) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text(f"{head}\n{ROWS}")
+    refused(path, message, unit="nm")
+
+
+def test_blanks_between_thousands_make_no_columns(tmp_path: Path) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text("\n".join("\t".join(f"1 0{value:05.2f}" for value in 10 * row) for row in HEIGHT_UM))
+    refused(path, "line 1.*no marks of thousands")
+
+
+def test_axes_in_the_last_row_and_column_are_no_heights(tmp_path: Path) -> None:
+    path = tmp_path / "scan.csv"
+    table = np.pad(np.tile(HEIGHT_UM, (2, 2)), ((0, 1), (0, 1)))
+    table[-1], table[:, -1] = 0.2 * np.arange(table.shape[1]), 0.2 * np.arange(len(table))
+    np.savetxt(path, table, fmt="%.4f", delimiter=",")
+    refused(path, "axes in the last row and column")
+
+
+def test_json_beside_a_page_is_read_like_words(tmp_path: Path) -> None:
+    path = tmp_path / "scan.tif"
+    tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), metadata={"unit": "nm"})
+    assert read_scan(path).unit == "nm"
+    tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), metadata={"scale": 10})
+    refused(path, "scale = 10")
+
+
+def test_what_lies_beside_a_map_in_an_archive_is_heeded(tmp_path: Path) -> None:
+    path = tmp_path / "scan.npz"
+    y, x = (0.2 * np.arange(count) for count in SHAPE)
+    np.savez(path, z=HEIGHT_UM.T, x=x, y=y, unit="um")
+    scan = read_scan(path)
+    np.testing.assert_array_equal(scan.height_um, HEIGHT_UM)
+    assert scan.require_pitch() == pytest.approx((0.2, 0.2))
+    for beside, message in (({"scale": 10.0}, "scale = 10"), ({"mask": HEIGHT_UM > 0}, "mask 'mask'")):
+        np.savez(path, z=HEIGHT_UM, **beside)
+        refused(path, message)
+
+
 def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:
     path = tmp_path / "scan.npy"
     height_um = np.random.default_rng(0).random((40, 50))
