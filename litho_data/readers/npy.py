@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array, Shape
-from litho_data.readers.arrays import Coordinate, array_channel
+from litho_data.readers.arrays import Coordinate, array_channel, refuse_mask
 from litho_data.readers.reader import (
     MOST_BYTES_PER_PACKED_BYTE,
     Channel,
@@ -68,8 +68,7 @@ def read_archive(path: Path) -> list[Channel]:
 
     def channel(name: str) -> Channel:
         shape, dtype = maps[name]
-        if shape in masks:
-            raise InputError(f"{path}: mask {masks[shape]!r}", wanted="NaN where pixels were not measured")
+        refuse_mask(shape, masks)
         return array_channel(
             name, dtype, shape, partial(_member, path, name), {}, coordinates=lines, around=around
         )

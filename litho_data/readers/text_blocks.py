@@ -2,7 +2,7 @@
 
 import codecs
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,7 +41,8 @@ _UNITS = ("valueunits", "valueunit", "einheiten", "unités", "unitàvalore", "un
 _NO_LENGTHS = {"V", "mV", "A", "nA", "pA", "N", "nN", "deg", "°", "rad", "Hz", "kHz", "%", "a.u."}
 # The unit of a column or of all numbers, as in "Height [nm]"; before a number it is that of a length.
 _TITLED = re.compile(
-    r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)\b\s*(?>(?:in\s+|[\[(]\s*)([^\])\s:=]{1,12})[\])]?)"
+    r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
+    r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
     r"(?!\s*[:=\t;,]\s*[-\d])",
     re.IGNORECASE,
 )
@@ -57,7 +58,7 @@ _SCALES = re.compile(
 )
 # A scale in prose: "multiply by 10", "heights in 0.1 nm".
 _SCALE_IN_WORDS = re.compile(
-    r"\b(multipl(y|ied)|divided?) by\b|"
+    r"\b(multipl(y|ied)|divided?) by\b|\b(counts?|digits?|bits?|lsb)\s*=\s*\d|"
     r"\b(z|heights?|values?|data)\b.{0,8}(\bin|\bx|[×*]) ?(?!1 )\d[\d.e^-]* ?([nuµμ]?m|Å)\b",
     re.IGNORECASE,
 )
@@ -110,12 +111,9 @@ class Block:
         Raises:
             InputError: the header gives another scale, which is not known here.
         """
-        stated = {key: value for key, value in self.header.items() if NUMBER.match(value)}
-        if _TO_METRES in stated:
-            return number(stated[_TO_METRES])
-        for key, value in stated.items():
-            if _SCALES.search(key.lower()) and number(value) not in (0.0, 1.0):
-                raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
+        if NUMBER.match(self.header.get(_TO_METRES, "")):
+            return number(self.header[_TO_METRES])
+        refuse_scales(self.header)
         for text in self.words:
             if _SCALE_IN_WORDS.search(text[:200]):
                 raise InputError(
@@ -135,6 +133,17 @@ class Block:
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(names)) for names in (_HEIGHTS, _WIDTHS)]
         return (sides[0], sides[1]) if sides[0] and sides[1] else None
+
+
+def refuse_scales(header: Mapping[str, str]) -> None:
+    """Refuse a header with a scale, which no format of these words gives.
+
+    Raises:
+        InputError: it has one.
+    """
+    for key, value in header.items():
+        if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):
+            raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
 
 
 def read_text(path: Path) -> str:
