@@ -109,13 +109,14 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     whole = predicted_topography(level, _BLUR_PX)
     topography, height = whole[sparse], arrays["height_um"][sparse]
     dose = record["columns"].get("dose")
+    response = _response(topography, height)
     return Print(
         id=record["id"],
         # Copies: a view would keep the whole.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
-        response=_response(topography, height),
-        edge_times=_edge_times(whole, arrays["height_um"]),
+        response=response,
+        edge_times=_edge_times(whole, arrays["height_um"], response[0]),
         highest_level=int(level.max()),
         layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
@@ -238,15 +239,18 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     return slope / max(float((from_mean**2).sum()), 1e-12), growth
 
 
-def _edge_times(topography: Array, height: Array) -> float:
-    """How many times as far the outermost pixels lie from the blurred layout as the others; 0 if unknown."""
+def _edge_times(topography: Array, height: Array, slope: float) -> float:
+    """How many times as far the outermost pixels lie from their layout as the others; 0 if unknown.
+
+    ``slope``: height per blurred level, µm.
+    """
     seen = np.isfinite(height)
     inner = seen & interior_of(height.shape, _EDGE_PX)
     edge = seen & ~inner
     if not inner.any() or not edge.any():
         return 0.0
-    line = np.polyfit(topography[inner], height[inner].astype(float), 1)
-    off = (height - np.polyval(line, topography)) ** 2
+    off = height - slope * topography
+    off = (off - off[inner].mean()) ** 2
     return float(np.sqrt(off[edge].mean() / max(off[inner].mean(), 1e-12)))
 
 

@@ -75,7 +75,7 @@ def test_numbers_beside_counts_may_be_their_calibration(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("z", data=np.ones(SHAPE, np.uint16)).attrs.update({"m": 1e-4, "b": 0.0})
-    refused(path, "m = 0.0001, b = 0.0")
+    refused(path, "b = 0.0, m = 0.0001")
 
 
 def test_arrays_show_what_runs_along_x(tmp_path: Path) -> None:
