@@ -18,7 +18,7 @@ _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 # Measured prints lie at 1.1 to 1.5, made ones with a rim as high as the substrate at 2, without it at 6 to 8.
-_EDGE_TIMES = 3.0
+_EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # What levelling left, as a share of the print's own standard deviation.
 _LEFT = 0.3
