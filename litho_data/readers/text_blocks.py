@@ -58,7 +58,7 @@ _SCALES = re.compile(
 )
 # A scale in prose: "multiply by 10", "heights in 0.1 nm".
 _SCALE_IN_WORDS = re.compile(
-    r"\b(multipl(y|ied)|divided?) by\b|\b(counts?|digits?|bits?|lsb)\s*=\s*\d|"
+    r"\b(multipl(y|ied)|divided?) by\b|\b(counts?|digits?|bits?|lsb)\s*=\s*\d[\d.e-]* ?([nuµμ]?m|Å)\b|"
     r"\b(z|heights?|values?|data)\b.{0,8}(\bin|\bx|[×*]) ?(?!1 )\d[\d.e^-]* ?([nuµμ]?m|Å)\b",
     re.IGNORECASE,
 )
