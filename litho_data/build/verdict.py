@@ -153,9 +153,9 @@ def _of_the_card(
     edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
     if edge_times > _EDGE_TIMES:
         text = (
-            f"their outermost pixels lie {edge_times:.0f} times as far from their layouts as the rest: say "
-            "in write.surround what lies around a field (substrate, if as high as level 0; else unknown, "
-            "which leaves these pixels out)"
+            f"their outermost pixels lie {edge_times:.0f} times as far from their layouts as the rest: set "
+            "write.surround to substrate if level 0 goes on around a field, else to unknown, which leaves "
+            "these pixels out"
         )
         yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
