@@ -68,7 +68,8 @@ class Check:
             return Checked(cause, share, f"not needed beside the others: {unneeded}")
         if larger := self._larger(cause, without):
             return Checked(cause, share, f"may only correct the formula of {larger}", corrects=True)
-        if exhausted := self.state.twin.exhausts(cause.name):
+        exhausted = self.state.twin.exhausts(cause.name)
+        if exhausted and share > FORM_SHARE:
             text = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
             return Checked(cause, share, text)
         if share > FORM_SHARE and reshaped_nm2 > LEFT_SHARE * self.left_nm2:

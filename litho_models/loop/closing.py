@@ -24,7 +24,7 @@ from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.screening import Secants
-from litho_models.loop.search import Cause, Found, search, untestable
+from litho_models.loop.search import Cause, Found, describe, search, untestable
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 
 # A law is a short formula: two terms at most.
@@ -33,15 +33,18 @@ MOST_LAWS, MOST_TABLES = 2, 2
 
 @dataclass(frozen=True)
 class Chosen:
-    """Three searches, one beside the other: among causes, short laws, and tables over a covariate.
+    """Two searches, one beside the other, and what lies in neither.
 
-    ``checked``: the causes with their checks, those that failed after those that hold.
+    Attributes:
+        named: among causes; ``checked``: they and those that failed, with their checks.
+        lawful: among short laws.
+        described: tables over a covariate, which say where the rest lies and enter no model.
     """
 
     named: Found
     checked: list[Checked]
     lawful: Found
-    tables: Found
+    described: list[Cause]
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,8 @@ class Closed:
 
     @property
     def final(self) -> State:
-        """The corrected model: causes, laws and tables."""
-        return self.chosen.tables.state
+        """The corrected model: causes and laws."""
+        return self.chosen.lawful.state
 
     @property
     def causes(self) -> list[Cause]:
@@ -80,8 +83,8 @@ class Closed:
 
     @property
     def found(self) -> list[Cause]:
-        """All that was added, tables too."""
-        return [*self.traced, *self.chosen.tables.causes]
+        """All that is reported."""
+        return [*self.traced, *self.chosen.described]
 
 
 def close(
@@ -113,12 +116,7 @@ def close(
     excluded = untestable(at_work)
     causes = [one for one in screened_effects(at_work.tip_radius_um) if one.name not in excluded]
     chosen = _chosen(start, at_work, causes, learner)
-    stages = {
-        "base": start,
-        "causes": chosen.named.state,
-        "laws": chosen.lawful.state,
-        "tables": chosen.tables.state,
-    }
+    stages = {"base": start, "causes": chosen.named.state, "laws": chosen.lawful.state}
     return Closed(
         study=at_work,
         original=original,
@@ -135,24 +133,22 @@ def _chosen(
 ) -> Chosen:
     """Each cause is checked with everything else in place.
 
-    One that fails is taken out, and laws and tables are sought anew without it.
+    One that fails is taken out, and laws are sought anew without it.
     """
     named = search(start, study, candidates)
     failed: list[Checked] = []
-    laws = list(LAWS.values())
+    laws, tables = list(LAWS.values()), list(TABLES.values())
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
         lawful = search(named.state, study, laws, MOST_LAWS, secants)
-        study.report("looking for a table of what is left")
-        tables = search(lawful.state, study, list(TABLES.values()), MOST_TABLES, secants)
+        study.report("describing what is left")
+        described = describe(lawful.state, study, tables, MOST_TABLES, secants)
         if not named.causes:
-            return Chosen(named, failed, lawful, tables)
-        # A table follows whatever it can. It is held against all causes together, not against single ones.
-        larger = lawful.state.mse_nm2 - tables.state.mse_nm2 > start.mse_nm2 - named.state.mse_nm2
-        beside = tables if larger else lawful
-        left_nm2 = learner().rest(held_out_maps(beside.state, study, study.scans)).mean_nm2
-        check = Check(beside.state, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
+            return Chosen(named, failed, lawful, described)
+        in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
+        left_nm2 = learner().rest(held_out_maps(in_place, study, study.scans)).mean_nm2
+        check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
         checked = [check.of(cause) for cause in named.causes]
         named.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
@@ -161,13 +157,24 @@ def _chosen(
             key=lambda one: (not one.corrects, one.cause.judgement.gain_nm2),
         )
         if not wrong:
-            return Chosen(named, [*checked, *failed], lawful, tables)
+            return Chosen(named, [*checked, *failed], lawful, described)
         name, reason = wrong[0].cause.name, wrong[0].reason
         study.report(f"{name}: {reason}")
         failed.append(wrong[0])
         named.refused[name] = reason
         named.causes = [cause for cause in named.causes if cause.name != name]
         named.state = named.state.without(name, study) if named.causes else start
+
+
+def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float, study: Study) -> State:
+    """The model, with the largest table beside it if that takes more than all causes together.
+
+    A table follows whatever it can. It is held against all causes, not against single ones.
+    """
+    table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
+    if table is None or table.judgement.gain_nm2 <= named_nm2:
+        return state
+    return fit_state(state.twin.with_effect(table.name, table.by, table.values), study, from_here=True)
 
 
 def held_out_maps(state: State, study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:

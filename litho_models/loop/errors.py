@@ -96,7 +96,7 @@ class HeldOut:
     def stages(self) -> dict[Stage, State]:
         """The models in order, each once."""
         found: dict[Stage, State] = {"base": self.closed.base}
-        if self.closed.causes and len(self.closed.found) > len(self.closed.causes):
+        if self.closed.causes and self.closed.chosen.lawful.causes:
             found["causes"] = self.closed.chosen.named.state
         return {**found, "all": self.closed.final}
 

@@ -149,10 +149,18 @@ def _found(
 
 
 def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for."""
+    """Numbers of an effect with intervals from what each print (or scan) asks for; of a table alone."""
     from scipy.stats import t
 
     state, effect, name = closed.final, get_effect(cause.name), cause.name
+    if cause.values:
+        return {
+            parameter: [
+                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
+                for label, values in cause.values.items()
+            ]
+            for parameter, facts in effect.parameters.items()
+        }
     twin = state.twin
     units = independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state.linear, units)), 0.0))

@@ -39,6 +39,7 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
+        values: of its parameters by label, where no model has it.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Cause:
     judgement: Judgement
     family_p: float
     group_p: float | None
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass
@@ -82,6 +84,21 @@ def search(
     while len(found.causes) < most and _add_one(found, study, candidates, secants):
         pass
     _defend(found, study)
+    return found
+
+
+def describe(
+    state: State, study: Study, tables: Sequence[Effect], most: int, secants: Secants | None = None
+) -> list[Cause]:
+    """Tables that stand out beside a model, each as a linear fit beside it alone; they enter no model."""
+    screening, found = Screening(state, study, tables, secants), []
+    for one in _standing(screening, Found(state))[:most]:
+        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
+        if judgement.passed(grouped=one.by != ALL):
+            group_p = None if one.by == ALL else screening.permutation_p(one)
+            found.append(
+                Cause(one.name, one.by, (), judgement, screening.family_p(one), group_p, one.start())
+            )
     return found
 
 

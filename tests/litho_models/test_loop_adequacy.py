@@ -54,7 +54,8 @@ def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
         (1.4, 0.0, [], ""),  # 14 % of its gain in other shapes
         (1.6, 5.0, [], "takes 16 % of its gain"),
         (1.6, 5.4, [], ""),  # more than twice as much again is left for causes that are missing
-        (0.0, 0.0, ["fraction"], "more of it than there can be: fraction"),
+        (1.6, 5.4, ["fraction"], "more of it than there can be: fraction"),
+        (1.4, 0.0, ["fraction"], ""),
     ],
 )
 def test_the_limits_of_a_name_are_those_that_are_written(
