@@ -73,10 +73,10 @@ def calibrate_one(seed: int) -> dict[str, Any]:
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     scans = null_scans(seed)
     fold_of = dealt(scans, FOLDS, 0)
-    closed = close(scans, fold_of, base, Study((), fold_of), describe=False)
+    closed = close(scans, fold_of, base, Study((), fold_of))
     return {
         "seed": seed,
-        "found": [cause.name for cause in (*closed.causes, *closed.lawful.causes)],
+        "found": [cause.name for cause in closed.traced],
         "rmse_before_nm": round(closed.base.mse_nm2**0.5, 3),
         "rmse_after_nm": round(closed.final.mse_nm2**0.5, 3),
     }

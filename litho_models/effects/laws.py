@@ -25,8 +25,9 @@ _COPIES_UM = {
     for dx in _STENCIL_UM
     if dy or dx
 }
-_KNOTS = {f"level_{knot}_of_8": knot for knot in range(9)}
-_POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
+_LAST_KNOT = 16
+_KNOTS = [f"level_{knot}_of_{_LAST_KNOT}" for knot in range(_LAST_KNOT + 1)]
+_POWERS = [f"y{i}_x{j}" for i in range(5) for j in range(5 - i) if i + j]
 _TURN = "print and scan the same layouts turned by 90 degrees"
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
@@ -64,25 +65,34 @@ class Surface:
 
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
         """Mean nearby of a map, of the height unless given, weighted by a Gaussian."""
-        return _blurred(self.h if of is None else of, self.context, reach_um)
+        field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
+        return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
 
     def beside(self, side: str, length_um: float) -> Tensor:
         """Mean height on one side, weighted by an exponential of that length."""
         axis, sign = _SIDES[side]
+        return self._mean_of_tail(lambda fy, fx: -sign * (fx if axis == -1 else fy), length_um)
+
+    def along(self, direction: str, length_um: float) -> Tensor:
+        """Mean height along a direction, to both sides, weighted by an exponential of that length."""
+        along_y, along_x = _DIRECTIONS[direction]
+        # Both sides together: their phases cancel.
+        return self._mean_of_tail(lambda fy, fx: along_y * fy + along_x * fx, length_um, both=True)
+
+    def _mean_of_tail(
+        self, along: Callable[[Tensor, Tensor], Tensor], length_um: float, both: bool = False
+    ) -> Tensor:
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            return trailing_response(-sign * (fx if axis == -1 else fy), length, pitch) - 1
+            tail = trailing_response(along(fy, fx), length, pitch)
+            return (tail.real if both else tail) - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
 
 # The map that a strength multiplies, (b, 1, y, x).
 Column = Callable[[Surface], Tensor]
-
-
-def _blurred(height: Tensor, context: FieldContext, sigma_um: float) -> Tensor:
-    return add_blur(height, height.new_tensor(sigma_um**2), context.pitch_um, 4 * sigma_um)
 
 
 def _columns() -> Iterator[tuple[str, str, str, Column]]:
@@ -123,6 +133,10 @@ def _columns() -> Iterator[tuple[str, str, str, Column]]:
         )
         steps = f"mean of |∇h| within {reach:g} µm"
         yield f"steps-within-{within}", steps, "1", lambda s, r=reach: s.mean(r, s.size(1, "x", "y"))
+    for axis in _DIRECTIONS:
+        for length in _TAILS_UM[1:]:
+            name, formula = f"along-{axis}-{length:g}-um", f"h along {axis} over {length:g} µm - h"
+            yield name, formula, "µm", lambda s, a=axis, n=length: s.along(a, n) - s.h
     for side in _SIDES:
         for length in _TAILS_UM:
             name, formula = f"{side}-{length:g}-um", f"h {side} over {length:g} µm - h"
@@ -164,24 +178,25 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a height of its own for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """One correction for each of nine heights of the layout, linear between them."""
-    share = _blurred(context.layout_um, context, 0.15) / context.full_height_um * 8
-    total = height
-    for name, knot in _KNOTS.items():
-        total = total + values[name] * torch.relu(1 - (share - knot).abs())
-    return total
+    """One correction for each of seventeen heights of the layout, linear between them."""
+    knots = torch.stack([values[name] for name in _KNOTS])
+    smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
+    share = (smooth / context.full_height_um * _LAST_KNOT).clamp(0, _LAST_KNOT)
+    below = share.floor().clamp(max=_LAST_KNOT - 1)
+    at = below.long()
+    return height + knots[at] + (share - below) * (knots[at + 1] - knots[at])
 
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
-    total, pitch, (ny, nx) = height, context.pitch_um, height.shape[-2:]
+    pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
+    total = height * (1 - sum(values[name] for name in _COPIES_UM))
     for name, (dy, dx) in _COPIES_UM.items():
         top, left = edge + round(dy / pitch), edge + round(dx / pitch)
-        moved = padded[..., top : top + ny, left : left + nx]
-        total = total + values[name] * (moved - height)
+        total = total + values[name] * padded[..., top : top + ny, left : left + nx]
     return total
 
 
@@ -189,8 +204,10 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The height times a polynomial of the place in the scan."""
     y, x = context.scan_position()
-    return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
+    # By columns: a polynomial of y times a power of x.
+    factor = sum(sum(values[f"y{i}_x{j}"] * y**i for i in range(5 - j) if i + j) * x**j for j in range(5))
+    return height * (1 + factor)
 
 
 LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
-DESCRIPTIONS = {one.name: one for one in (level_table, linear_response, place_map)}
+TABLES = {one.name: one for one in (level_table, linear_response, place_map)}

@@ -8,7 +8,7 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.effects import exposure_spot, exposure_writing, measurement, resist, single_scans
 from litho_models.effects.effect import Effect
-from litho_models.effects.laws import DESCRIPTIONS, LAWS
+from litho_models.effects.laws import LAWS, TABLES
 
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
 UNTESTABLE = {
@@ -64,7 +64,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
     """
-    if effect.name in {**CATALOGUE, **LAWS, **DESCRIPTIONS}:
+    if effect.name in {**CATALOGUE, **LAWS, **TABLES}:
         raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
     alike = [name for name, other in CATALOGUE.items() if other.stage == effect.stage]
     behind = get_effect(after).name if after else alike[-1]
@@ -81,7 +81,7 @@ def get_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
-    if (nameless := LAWS.get(name) or DESCRIPTIONS.get(name)) is not None:
+    if (nameless := LAWS.get(name) or TABLES.get(name)) is not None:
         return nameless
     require_known("effect", name, CATALOGUE)
     return CATALOGUE[name]
@@ -94,7 +94,7 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
         InputError: a name that is no effect's.
     """
     given = {get_effect(name).name for name in names}
-    known = {**CATALOGUE, **LAWS, **DESCRIPTIONS}
+    known = {**CATALOGUE, **LAWS, **TABLES}
     # What has no name acts on the finished print, before the microscope sees it.
     ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
     return [name for name in ordered if name in given]

@@ -16,75 +16,32 @@ from torch import nn
 
 from litho_data.store import PrintedScan
 from litho_models.effects import Effect, screened_effects
-from litho_models.effects.laws import DESCRIPTIONS, LAWS
+from litho_models.effects.laws import LAWS, TABLES
 from litho_models.fitting.least_squares import fit_least_squares
-from litho_models.loop.adequacy import reshaped_gain
+from litho_models.loop.checking import Check, Checked
 from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
-from litho_models.loop.judging import judge
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, search, untestable
-from litho_models.loop.search import describe as describe_rest
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 
-# Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
-# formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
-# more.
-FORM_SHARE = 0.15
-# Of what is left to be explained: less is the little that any columns take of causes that are still missing.
-LEFT_SHARE = 0.3
-# A cause that gains this little beside another may be an error of the other's formula: it is, if the other's
-# change in another shape would take half of what it takes.
-SMALL_SHARE, REPEATED_SHARE = 0.1, 0.5
 # A law is a short formula: two terms at most.
-MOST_LAWS, MOST_DESCRIPTIONS = 2, 2
+MOST_LAWS, MOST_TABLES = 2, 2
 
 
 @dataclass(frozen=True)
-class Checked:
-    """A cause with the check of its formula, nm² on held-out scans.
+class Chosen:
+    """Three searches, one beside the other: among causes, short laws, and tables over a covariate.
 
-    Attributes:
-        cause: what was added; ``reshaped_nm2``: what its change in other shapes would take beside it.
-        left_nm2: what all features of layout and place still explain beside everything named.
-        corrects: a much larger cause whose formula it may only correct; empty if none.
-        exhausted: its amplitudes whose fit ends at the limit of their range.
+    ``checked``: the causes with their checks, those that failed after those that hold.
     """
 
-    cause: Cause
-    reshaped_nm2: float
-    left_nm2: float = 0.0
-    corrects: str = ""
-    exhausted: Sequence[str] = ()
-
-    @property
-    def gain_nm2(self) -> float:
-        return self.cause.judgement.gain_nm2
-
-    @property
-    def reshaped_share(self) -> float:
-        """Of the cause's own gain."""
-        return self.reshaped_nm2 / max(self.gain_nm2, 1e-9)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the name stands."""
-        return not self.reason
-
-    @property
-    def reason(self) -> str:
-        """Why the name does not stand; empty if it does."""
-        if self.corrects:
-            return f"may only correct the formula of {self.corrects}"
-        if self.exhausted:
-            return f"the scans ask for more of it than there can be: {', '.join(self.exhausted)}"
-        if self.reshaped_share > FORM_SHARE and self.reshaped_nm2 > LEFT_SHARE * self.left_nm2:
-            share = 100 * self.reshaped_share
-            return (
-                f"only resembles the cause: its change in another shape takes {share:.0f} % of its gain more"
-            )
-        return ""
+    named: Found
+    checked: list[Checked]
+    lawful: Found
+    tables: Found
 
 
 @dataclass(frozen=True)
@@ -94,8 +51,6 @@ class Closed:
     Attributes:
         study: the scans, freed of what they share by group.
         plain: the base fitted to the scans as they are; ``base``: to the freed ones.
-        named: the search among causes; ``checked``: each of its causes with the check of its formula.
-        lawful: the search among laws, beside the causes; ``described``: where the rest lies, beside both.
         rests: what features of layout and place still explain, by stage.
         untestable: effects that could not be tested, with the reason.
     """
@@ -104,22 +59,29 @@ class Closed:
     original: Sequence[PreparedScan]
     plain: State
     base: State
-    named: Found
-    checked: list[Checked]
-    lawful: Found
-    described: list[Cause]
+    chosen: Chosen
     rests: dict[str, Rest]
     untestable: dict[str, str]
 
     @property
     def final(self) -> State:
-        """The corrected model: causes and laws. A description says where the rest lies, no more."""
-        return self.lawful.state
+        """The corrected model: causes, laws and tables."""
+        return self.chosen.tables.state
 
     @property
     def causes(self) -> list[Cause]:
         """Named causes whose formula stands."""
-        return [one.cause for one in self.checked if one.holds]
+        return self.chosen.named.causes
+
+    @property
+    def traced(self) -> list[Cause]:
+        """Causes and laws."""
+        return [*self.causes, *self.chosen.lawful.causes]
+
+    @property
+    def found(self) -> list[Cause]:
+        """All that was added, tables too."""
+        return [*self.traced, *self.chosen.tables.causes]
 
 
 def close(
@@ -127,8 +89,6 @@ def close(
     fold_of: np.ndarray,
     base: nn.Module,
     study: Study,
-    *,
-    describe: bool = True,
 ) -> Closed:
     """Find what a base lacks on these scans.
 
@@ -136,7 +96,6 @@ def close(
         scans: development scans; ``fold_of``: (scans,) fold that holds each out.
         base: simulator with few parameters, which is refitted, or one that is taken as it is.
         study: settings: seed, workers, report.
-        describe: also say where the rest lies, which changes no model.
     """
     original = prepare_scans(scans)
     plain = replace(study, scans=original, fold_of=fold_of)
@@ -153,72 +112,62 @@ def close(
 
     excluded = untestable(at_work)
     causes = [one for one in screened_effects(at_work.tip_radius_um) if one.name not in excluded]
-    named, checked = _named(start, at_work, causes, learner)
-    study.report("looking for a law in what is left")
-    lawful = search(named.state, at_work, list(LAWS.values()), MOST_LAWS)
-    described: list[Cause] = []
-    if describe:
-        study.report("describing what is left")
-        described = describe_rest(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
-    stages = {"base": start, "causes": named.state, "laws": lawful.state}
+    chosen = _chosen(start, at_work, causes, learner)
+    stages = {
+        "base": start,
+        "causes": chosen.named.state,
+        "laws": chosen.lawful.state,
+        "tables": chosen.tables.state,
+    }
     return Closed(
         study=at_work,
         original=original,
         plain=first,
         base=start,
-        named=named,
-        checked=checked,
-        lawful=lawful,
-        described=described,
-        rests=_rests(stages, at_work, learner()) if describe else {},
+        chosen=chosen,
+        rests=_rests(stages, at_work, learner()),
         untestable=excluded,
     )
 
 
-def _named(
+def _chosen(
     start: State, study: Study, candidates: Sequence[Effect], learner: Callable[[], Learner]
-) -> tuple[Found, list[Checked]]:
-    """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
-    found = search(start, study, candidates)
+) -> Chosen:
+    """Each cause is checked with everything else in place.
+
+    One that fails is taken out, and laws and tables are sought anew without it.
+    """
+    named = search(start, study, candidates)
     failed: list[Checked] = []
-    while found.causes:
-        left_nm2 = learner().rest(held_out_maps(found.state, study, study.scans)).mean_nm2
-        checked = [_checked(cause, found, left_nm2, study) for cause in found.causes]
-        found.causes = [one.cause for one in checked]
+    laws = list(LAWS.values())
+    secants = Secants(start.twin, study.windows)
+    while True:
+        study.report("looking for a law in what is left")
+        lawful = search(named.state, study, laws, MOST_LAWS, secants)
+        study.report("looking for a table of what is left")
+        tables = search(lawful.state, study, list(TABLES.values()), MOST_TABLES, secants)
+        if not named.causes:
+            return Chosen(named, failed, lawful, tables)
+        # A table follows whatever it can. It is held against all causes together, not against single ones.
+        larger = lawful.state.mse_nm2 - tables.state.mse_nm2 > start.mse_nm2 - named.state.mse_nm2
+        beside = tables if larger else lawful
+        left_nm2 = learner().rest(held_out_maps(beside.state, study, study.scans)).mean_nm2
+        check = Check(beside.state, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
+        checked = [check.of(cause) for cause in named.causes]
+        named.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
         wrong = sorted(
-            (one for one in checked if not one.holds), key=lambda one: (not one.corrects, one.gain_nm2)
+            (one for one in checked if one.reason),
+            key=lambda one: (not one.corrects, one.cause.judgement.gain_nm2),
         )
         if not wrong:
-            return found, [*checked, *failed]
+            return Chosen(named, [*checked, *failed], lawful, tables)
         name, reason = wrong[0].cause.name, wrong[0].reason
         study.report(f"{name}: {reason}")
         failed.append(wrong[0])
-        found.refused[name] = reason
-        found.causes = [cause for cause in found.causes if cause.name != name]
-        found.state = found.state.without(name, study) if found.causes else start
-    return found, failed
-
-
-def _checked(cause: Cause, found: Found, left_nm2: float, study: Study) -> Checked:
-    """A cause, judged with all others in place."""
-    without = found.state.without(cause.name, study)
-    cause = replace(cause, judgement=judge(without.freed_nm2, found.state.freed_nm2, study))
-    reshaped_nm2 = reshaped_gain(without, found.state, study)
-    return Checked(
-        cause, reshaped_nm2, left_nm2, _larger(cause, found, study), found.state.twin.exhausts(cause.name)
-    )
-
-
-def _larger(cause: Cause, found: Found, study: Study) -> str:
-    """A much larger cause whose change in another shape takes what this one does; empty if none."""
-    gain, without = cause.judgement.gain_nm2, found.state.without(cause.name, study)
-    for other in found.causes:
-        if gain < SMALL_SHARE * other.judgement.gain_nm2:
-            neither = without.without(other.name, study)
-            if reshaped_gain(neither, without, study) >= REPEATED_SHARE * gain:
-                return other.name
-    return ""
+        named.refused[name] = reason
+        named.causes = [cause for cause in named.causes if cause.name != name]
+        named.state = named.state.without(name, study) if named.causes else start
 
 
 def held_out_maps(state: State, study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:

@@ -96,8 +96,8 @@ class HeldOut:
     def stages(self) -> dict[Stage, State]:
         """The models in order, each once."""
         found: dict[Stage, State] = {"base": self.closed.base}
-        if self.closed.causes and self.closed.lawful.causes:
-            found["causes"] = self.closed.named.state
+        if self.closed.causes and len(self.closed.found) > len(self.closed.causes):
+            found["causes"] = self.closed.chosen.named.state
         return {**found, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:

@@ -54,10 +54,7 @@ def record(
         left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
     """
     study, scans = closed.study, closed.study.scans
-    effects = [
-        _found(closed, one, left_out_nm, survives_on)
-        for one in (*closed.causes, *closed.lawful.causes, *closed.described)
-    ]
+    effects = [_found(closed, one, left_out_nm, survives_on) for one in closed.found]
     before, after = error_of(errors, "base"), error_of(errors, "all")
     assert before is not None
     assert after is not None
@@ -98,7 +95,7 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
         return "described"
     if len(closed.study.scans) < FEWEST_SCANS:
         return "too-few-scans"
-    left = [*closed.rests.values()][-1].matters or closed.named.refused
+    left = [*closed.rests.values()][-1].matters or closed.chosen.named.refused
     return "unexplained" if left else "nothing-missing"
 
 
@@ -126,7 +123,7 @@ def _found(
     effect = get_effect(cause.name)
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     verdict = verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained")
-    reshaped = next((c.reshaped_share for c in closed.checked if c.cause.name == cause.name), None)
+    reshaped = next((c.reshaped_share for c in closed.chosen.checked if c.cause.name == cause.name), None)
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
     return FoundEffect(
         name=cause.name,
@@ -152,18 +149,10 @@ def _found(
 
 
 def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for; of a description alone."""
+    """Numbers of an effect with intervals from what each print (or scan) asks for."""
     from scipy.stats import t
 
     state, effect, name = closed.final, get_effect(cause.name), cause.name
-    if cause.values:
-        return {
-            parameter: [
-                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
-                for label, values in cause.values.items()
-            ]
-            for parameter, facts in effect.parameters.items()
-        }
     twin = state.twin
     units = independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state.linear, units)), 0.0))
@@ -244,13 +233,13 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
 
 
 def _candidate(closed: Closed, name: str, sets: Mapping[str, str]) -> Candidate:
-    named = closed.named
+    named = closed.chosen.named
     last = named.last.get(name) or named.first.get(name)
     p = named.family_p.get(name)
     verdict: CandidateVerdict
     if name in sets:
         verdict, reason = "confusable", f"cannot be told from {sets[name]}, which was added"
-    elif any(one.cause.name == name and not one.holds for one in closed.checked):
+    elif any(one.cause.name == name and one.reason for one in closed.chosen.checked):
         verdict, reason = "resembles", named.refused.get(name, "")
     elif last is None:
         verdict, reason = "not-testable", "not screened"

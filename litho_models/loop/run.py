@@ -166,7 +166,7 @@ def _again(base: nn.Module, study: Study) -> Callable[[Sequence[PrintedScan]], C
     def close_again(scans: Sequence[PrintedScan]) -> Closed:
         fold_of = dealt(scans, len(study.folds), study.seed)
         quiet = replace(study, fold_of=fold_of, report=lambda message: None)
-        return close(scans, fold_of, base, quiet, describe=False)
+        return close(scans, fold_of, base, quiet)
 
     return close_again
 

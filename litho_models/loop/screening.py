@@ -6,17 +6,19 @@ Its strength is one for all scans or one by group. Of each scan only inner produ
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.effects import Effect
+from litho_models.effects import Effect, get_effect
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.loop.fits import ALL_FREE, State, Study
-from litho_models.loop.model import finished
+from litho_models.loop.model import Twin, finished
+from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL, Labels
 from litho_models.scoring.statistics import sign_flips
@@ -145,35 +147,67 @@ def trials_of(effects: Sequence[Effect]) -> list[Trial]:
     return found
 
 
+class Secants:
+    """What trials change in the windows at a model; what is known of one is not computed again."""
+
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
+        self._placed, self._windows = twin.placed(), windows
+        self._known: dict[tuple[str, tuple[object, ...]], list[NDArray[np.float32]]] = {}
+
+    def learn(self, trials: Sequence[Trial]) -> None:
+        """Compute what is not known yet."""
+        new = {
+            (trial.effect.name, tuple(values.items())): trial.effect.with_values(values)
+            for trial in trials
+            for values in trial.sets
+        }
+        new = {key: values for key, values in new.items() if key not in self._known}
+        self._known |= {key: [] for key in new}
+        for window in self._windows if new else ():
+            chain = self._placed.chain(window)
+            base = self._placed.base_height(chain, window)
+            here = finished(chain, base, window)
+            for (name, at), values in new.items():
+                moved = self._placed.chain(window, {name: values})
+                same = get_effect(name).acts_on == "height"
+                height = base if same else self._placed.base_height(moved, window)
+                change = window.at_sample(finished(moved, height, window) - here)
+                self._known[name, at].append(change.astype(np.float32))
+
+    def of(self, trials: Sequence[Trial], number: int) -> list[NDArray[np.float32]]:
+        """Changes (n,), µm, in one window, a row for each set of each trial."""
+        return [
+            self._known[trial.effect.name, tuple(values.items())][number]
+            for trial in trials
+            for values in trial.sets
+        ]
+
+    def free_terms(self, number: int) -> np.ndarray:
+        """Orthonormal basis (n, k) of what one window may add by itself."""
+        window = self._windows[number]
+        return orthonormal(window.terms_at_sample(self._placed.height(window), ALL_FREE).T)
+
+
 class Screening:
-    """Secants of all trials at a fitted state, and their inner products with what the state leaves.
+    """Secants of all trials, and their inner products with what a fitted state leaves.
 
     Args:
         state: the model so far; ``study``: its scans; ``effects``: candidates, none of them in the model.
+        secants: at another model, near enough to tell what is worth fitting; by default at the state.
     """
 
-    def __init__(self, state: State, study: Study, effects: Sequence[Effect]):
+    def __init__(self, state: State, study: Study, effects: Sequence[Effect], secants: Secants | None = None):
         self.study = study
         self.trials = trials_of(effects)
-        twin = state.twin
-        self._own = len(twin.vector)
+        self._own = len(state.twin.vector)
+        secants = secants or Secants(state.twin, study.windows)
+        secants.learn(self.trials)
         count = 1 + self._own + sum(len(trial.sets) for trial in self.trials)
         grams = np.empty((len(study.scans), count, count))
         raw = np.zeros(count)
-        placed = twin.placed()
-        for at, window in enumerate(study.windows):
-            chain = placed.chain(window)
-            base = placed.base_height(chain, window)
-            here = finished(chain, base, window)
-            columns = [state.held_out_um[at], *state.linear[at].jacobian]
-            for trial in self.trials:
-                for values in trial.sets:
-                    extra = {trial.effect.name: trial.effect.with_values(values)}
-                    moved = placed.chain(window, extra)
-                    height = base if trial.effect.acts_on == "height" else placed.base_height(moved, window)
-                    columns.append(window.at_sample(finished(moved, height, window) - here))
-            stacked = np.column_stack(columns)
-            basis = orthonormal(window.terms_at_sample(here, ALL_FREE).T)
+        for at in range(len(study.scans)):
+            columns = [state.held_out_um[at], *state.linear[at].jacobian, *secants.of(self.trials, at)]
+            stacked, basis = np.column_stack(columns), secants.free_terms(at)
             whole = stacked.T @ stacked / len(stacked)
             grams[at] = whole - gram_inside(stacked, basis) / len(stacked)
             raw += np.diag(whole)
@@ -216,15 +250,8 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def permutation_p(self, one: Screened) -> float:
-        """Share of exchanges of the scans after which a strength by any grouping gains as much as this."""
-        groupings = [np.array(labels) for by, labels in self.study.groups.items() if by != ALL]
-        rng = np.random.default_rng(self.study.seed)
-        beaten = 0
-        for _ in range(PERMUTATIONS):
-            order = rng.permutation(len(self.freed))
-            gains = (self._gains(one.trial, one.columns, tuple(own[order]))[0] for own in groupings)
-            beaten += any(own.mean() >= one.gain_nm2 * (1 - 1e-12) for own in gains)
-        return (1 + beaten) / (1 + PERMUTATIONS)
+        """See ``permutation_p``."""
+        return permutation_p(self.study, one.gain_nm2, lambda by: self._gains(one.trial, one.columns, by)[0])
 
     def family_p(self, one: Screened) -> float:
         """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
@@ -254,26 +281,49 @@ class Screening:
         self, trial: Trial, columns: tuple[int, ...], labels: Labels
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Held-out gains (scans,) nm², and the multiples by label from all scans."""
-        grams, fold_of = self.freed, self.study.fold_of
-        own = np.array(columns)
-        scores, infos = grams[:, own, 0], grams[:, own[:, None], own[None, :]]
-        gains, multiples = np.zeros(len(grams)), {}
-        members = np.array(labels)
-        for label in dict.fromkeys(labels):
-            inside = members == label
-            total_score, total_info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
-            multiples[label] = _solved(total_info, total_score)
-            for fold in np.unique(fold_of[inside]):
-                out = inside & (fold_of == fold)
-                kept = inside & (fold_of != fold)
-                if not kept.any():
-                    continue
+        return gains_by(
+            self.freed, self.study.fold_of, columns, labels, lambda own: trial.allowed(own) * trial.reach(own)
+        )
+
+
+def gains_by(
+    grams: np.ndarray,
+    fold_of: np.ndarray,
+    columns: Sequence[int],
+    labels: Labels,
+    taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Held-out gains (scans,) nm² of some columns with strengths by label, and those from all scans.
+
+    Args:
+        grams: (scans, 1 + m, 1 + m), residual first, µm²; ``taken``: share of the strengths that is taken.
+    """
+    own, members = np.array(columns), np.array(labels)
+    scores, infos = grams[:, own, 0], grams[:, own[:, None], own[None, :]]
+    gains, multiples = np.zeros(len(grams)), {}
+    for label in dict.fromkeys(labels):
+        inside = members == label
+        total_score, total_info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
+        multiples[label] = _solved(total_info, total_score)
+        for fold in np.unique(fold_of[inside]):
+            out = inside & (fold_of == fold)
+            if out.sum() < inside.sum():
                 found = _solved(total_info - infos[out].sum(axis=0), total_score - scores[out].sum(axis=0))
-                if not trial.allowed(found):
-                    continue
-                found = found * trial.reach(found)
+                found = found * taken(found)
                 gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
-        return gains * NM_PER_UM**2, multiples
+    return gains * NM_PER_UM**2, multiples
+
+
+def permutation_p(study: Study, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
+    """Share of exchanges of the scans after which a strength by any grouping gains as much as this."""
+    groupings = [np.array(labels) for by, labels in study.groups.items() if by != ALL]
+    rng = np.random.default_rng(study.seed)
+    beaten = 0
+    for _ in range(PERMUTATIONS):
+        order = rng.permutation(len(study.scans))
+        gains = (gains_of(tuple(own[order])) for own in groupings)
+        beaten += any(own.mean() >= gain_nm2 * (1 - 1e-12) for own in gains)
+    return (1 + beaten) / (1 + PERMUTATIONS)
 
 
 def _solved(info: np.ndarray, score: np.ndarray) -> np.ndarray:

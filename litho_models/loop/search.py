@@ -15,8 +15,9 @@ import numpy as np
 from litho_data.foundation.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import FAMILY_P, Judgement, judge, told_apart
-from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening
+from litho_models.loop.judging import FAMILY_P, GROUPED_P, Judgement, judge, told_apart
+from litho_models.loop.regrouping import NEARLY, regrouped
+from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening, Secants
 from litho_models.scan_terms.groups import ALL
 
 MOST_EFFECTS = 8
@@ -38,7 +39,6 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        values: of its parameters by label, where no model has it.
     """
 
     name: str
@@ -47,7 +47,6 @@ class Cause:
     judgement: Judgement
     family_p: float
     group_p: float | None
-    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass
@@ -66,37 +65,31 @@ class Found:
         return [cause.name for cause in self.causes]
 
 
-def search(start: State, study: Study, candidates: Sequence[Effect], most: int = MOST_EFFECTS) -> Found:
+def search(
+    start: State,
+    study: Study,
+    candidates: Sequence[Effect],
+    most: int = MOST_EFFECTS,
+    secants: Secants | None = None,
+) -> Found:
     """Add effects to a fitted model, at most so many.
 
     Args:
         start: the model so far; ``study``: scans, folds and groups; ``candidates``: what may be added.
+        secants: of the candidates at a model like this one; by default at the model itself.
     """
     found = Found(start)
-    while len(found.causes) < most and _add_one(found, study, candidates):
+    while len(found.causes) < most and _add_one(found, study, candidates, secants):
         pass
     _defend(found, study)
     return found
 
 
-def describe(state: State, study: Study, candidates: Sequence[Effect], most: int) -> list[Cause]:
-    """Those that stand out beside a model, each as a linear fit beside it alone; they enter no model."""
-    screening, found = Screening(state, study, candidates), []
-    for one in _standing(screening, Found(state))[:most]:
-        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
-        if judgement.passed(grouped=one.by != ALL):
-            group_p = None if one.by == ALL else screening.permutation_p(one)
-            found.append(
-                Cause(one.name, one.by, (), judgement, screening.family_p(one), group_p, one.start())
-            )
-    return found
-
-
-def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
+def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: Secants | None) -> bool:
     effects = [one for one in candidates if one.name not in found.state.twin.names]
     if not effects:
         return False
-    screening = Screening(found.state, study, effects)
+    screening = Screening(found.state, study, effects, secants)
     standing = _standing(screening, found)
     study.report(f"{len(standing)} of {len(effects)} candidates stand out")
     tried: set[str] = set()
@@ -116,10 +109,26 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
             found.causes.append(Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
+            if one.by == ALL:
+                _by_group(found, study)
             gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
+
+
+def _by_group(found: Found, study: Study) -> None:
+    """Let the strength of the cause that was just added differ by group, if that is confirmed."""
+    cause = found.causes[-1]
+    other = regrouped(found.state, cause.name, study)
+    if other is None:
+        return
+    by, p, twin = other
+    state = fit_state(twin, study, from_here=True)
+    if judge(found.state.freed_nm2, state.freed_nm2, study).p <= GROUPED_P:
+        study.report(f"{cause.name} differs by {by}")
+        found.causes[-1] = replace(cause, by=by, group_p=p)
+        found.state = state
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
@@ -190,7 +199,7 @@ def _grouped(
         return None
     best = max(better, key=lambda one: one.gain_nm2)
     # Of groupings that do nearly as well the one with the fewest numbers.
-    close = [one for one in better if one.gain_nm2 >= 0.95 * best.gain_nm2]
+    close = [one for one in better if one.gain_nm2 >= NEARLY * best.gain_nm2]
     best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
     return best if screening.permutation_p(best) <= FAMILY_P else None
 

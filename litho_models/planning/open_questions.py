@@ -46,7 +46,7 @@ def open_questions(
 ) -> OpenQuestions:
     """Everything that is open, the most valuable first, rivals fitted."""
     asking = _Asking(closed, report)
-    found = [asking.of_cause(one) for one in (*closed.causes, *closed.lawful.causes)]
+    found = [asking.of_cause(one) for one in closed.traced]
     stored = [scan.stored for scan in closed.study.scans]
     return OpenQuestions(
         dataset=result.dataset,
@@ -87,8 +87,9 @@ class _Asking:
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
+        chosen = self.closed.chosen
         # In the place of another a member starts as before any of them was found.
-        first = {**self.closed.lawful.first, **self.closed.named.first}
+        first = {**chosen.lawful.first, **chosen.named.first}
         twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
         rests = list(self.closed.rests.values())
         return _question(
@@ -101,7 +102,7 @@ class _Asking:
 
     def of_suspects(self) -> Question | None:
         """What stood out and was not confirmed: which of these carries what is left, if any does."""
-        named = self.closed.named
+        named = self.closed.chosen.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
             one

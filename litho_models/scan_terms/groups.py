@@ -29,7 +29,9 @@ def label_of(scan: PrintedScan, by: str) -> str:
     # A group of the card may have any word for a name, but no blank in it.
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
-        return "before" if scan.order < int(value) else "from there on"
+        last, first = map(int, value.split("-"))
+        # Of a scan in between nobody knows whether the change had come.
+        return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
     if value and kind == _CHARACTER:
         return scan.id[int(value) - 1 : int(value)]
     return ""
@@ -53,10 +55,12 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
         if name == ALL or (_is_grouped(labels) and not _is_known(labels, found)):
             found[name] = labels
     if by_order:
-        for place in _places(scans, found.get("print")):
-            labels = tuple(label_of(scan, f"{_ORDER} {place}") for scan in scans)
+        for first in _places(scans, found.get("print")):
+            last = max(scan.order for scan in scans if scan.order < first)
+            name = f"{_ORDER} {last}-{first}"
+            labels = tuple(label_of(scan, name) for scan in scans)
             if not _is_known(labels, found):
-                found[f"{_ORDER} {place}"] = labels
+                found[name] = labels
     return found
 
 
@@ -79,5 +83,5 @@ def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
             label: min(s.order for s, own in zip(scans, prints, strict=True) if own == label)
             for label in prints
         }
-        return sorted(first.values())[1:]
+        return [order for order in sorted(set(first.values())) if order > orders[0]]
     return orders[FEWEST_IN_GROUP : len(orders) - FEWEST_IN_GROUP + 1]

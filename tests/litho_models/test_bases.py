@@ -49,7 +49,7 @@ def no_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """No cause and no law is looked for: that takes time and has its own tests."""
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
     monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+    monkeypatch.setattr(closing, "TABLES", {})
 
 
 def settings_of(scans: Sequence[PrintedScan]) -> Study:
@@ -91,7 +91,7 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
     other = [s.height_um + 0.2 * s.layout_um**2 if i in out else s.height_um for i, s in enumerate(scans)]
     maps, fitted = [], []
     for own in (scans, with_heights(scans, other)):
-        closed = close(own, study.fold_of, bases_of(own, study)[base], study, describe=False)
+        closed = close(own, study.fold_of, bases_of(own, study)[base], study)
         # With a law in the model: its number is fitted too.
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1])

@@ -69,7 +69,15 @@ def test_a_change_may_come_where_a_print_begins() -> None:
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32")
     orders = {by: labels for by, labels in groupings(scans).items() if by.startswith("order")}
     before = {by: labels.count("before") for by, labels in orders.items()}
-    assert before == {"order 2": 2, "order 4": 4}
+    assert before == {"order 1-2": 2, "order 3-4": 4}
+
+
+def test_between_two_known_scans_nobody_knows_whether_a_change_had_come() -> None:
+    """A print that was left out lies there: it gets the mean of both sides."""
+    scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32", "F41", "F42")
+    by, _ = (by for by in groupings([*scans[:2], *scans[4:]]) if by.startswith("order"))
+    assert by == "order 1-4"
+    assert [label_of(scan, by) for scan in scans] == ["before"] * 2 + [""] * 2 + ["from there on"] * 4
 
 
 def test_without_prints_a_change_may_come_anywhere_with_two_scans_on_each_side() -> None:

@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
-from litho_models.effects.laws import DESCRIPTIONS, LAWS
+from litho_models.effects.laws import LAWS, TABLES
 from litho_models.effects.registry import register_effect
 
 PITCH_UM, SHAPE = 0.1, (170, 168)
-NAMELESS = {**LAWS, **DESCRIPTIONS}
+NAMELESS = {**LAWS, **TABLES}
 BY_NAME = pytest.mark.parametrize("name", NAMELESS)
 # Slopes are rounded off below this, and a size by no more than this.
 ROUNDED = 1e-3
@@ -69,6 +69,21 @@ def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
     return {"left": found, "right": found[:, ::-1], "above": found.T, "below": found[:, ::-1].T}[side]
 
 
+def along(h: np.ndarray, direction: str, length_um: float) -> np.ndarray:
+    """The mean of both sides; of a diagonal by its frequencies."""
+    if direction in "xy":
+        sides = ("left", "right") if direction == "x" else ("above", "below")
+        return (beside(h, sides[0], length_um) + beside(h, sides[1], length_um)) / 2
+    edge = 6 * round(length_um / PITCH_UM)
+    padded = np.pad(h, edge, mode="edge")
+    fy, fx = (np.fft.fftfreq(n, PITCH_UM) for n in padded.shape)
+    sign = {"diagonal": 1, "antidiagonal": -1}[direction]
+    frequency = (fy[:, None] + sign * fx[None, :]) / 2**0.5
+    transfer = 1 / (1 + length_um / PITCH_UM * (1 - np.exp(-2j * np.pi * frequency * PITCH_UM)))
+    filtered = np.fft.ifft2(np.fft.fft2(padded) * transfer.real).real
+    return filtered[edge:-edge, edge:-edge]
+
+
 Y, X = (np.linspace(-1, 1, n) for n in SHAPE)
 PLACES = {"x": X[None, :] + 0 * Y[:, None], "y": Y[:, None] + 0 * X[None, :]}
 PLACES["r2"] = PLACES["x"] ** 2 + PLACES["y"] ** 2
@@ -106,6 +121,9 @@ def formulas() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
         found[f"steps-within-{end}"] = lambda h, r=reach: mean_within(
             np.hypot(slope(h, "x"), slope(h, "y")), r
         )
+    for axis in ("x", "y", "diagonal", "antidiagonal"):
+        for length in (2.0, 6.0):
+            found[f"along-{axis}-{length:g}-um"] = lambda h, a=axis, n=length: along(h, a, n) - h
     for side in SIDES:
         for length in (0.6, 2.0, 6.0):
             name = f"{side}-{length:g}-um".replace(".", "-")
@@ -128,8 +146,8 @@ def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
     # Besides the rounding, which a place may double: a Gaussian ends after 4 sigma, a tail after 6 lengths,
     # or a field, with what comes around from the other side.
     allowed = 2 * ROUNDED
-    if name.split("-")[0] in SIDES and "surroundings" not in name:
-        steps = float(".".join(name.split("-")[1:-1])) / PITCH_UM
+    if name.split("-")[0] in (*SIDES, "along") and "surroundings" not in name:
+        steps = float(".".join(part for part in name.split("-") if part.isdigit())) / PITCH_UM
         allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
     found = changed(name, {"strength": 0.05}, HEIGHT)
     np.testing.assert_allclose(found, 0.05 * wanted, atol=0.05 * allowed, rtol=1e-9)
@@ -168,16 +186,16 @@ def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
 
 
 def test_a_table_of_one_height_is_a_datum_and_each_level_has_its_own() -> None:
-    names = DESCRIPTIONS["level-table"].amplitudes
+    names = TABLES["level-table"].amplitudes
     np.testing.assert_allclose(changed("level-table", dict.fromkeys(names, 0.02), HEIGHT), 0.02, atol=1e-12)
     flat = np.full((30, 30), 0.6)
     for knot, name in enumerate(names):
-        # 0.6 of 1.2 µm is the fourth of eight steps.
-        np.testing.assert_allclose(changed("level-table", {name: 0.02}, flat), 0.02 * (knot == 4), atol=1e-9)
+        # 0.6 of 1.2 µm is the eighth of sixteen steps.
+        np.testing.assert_allclose(changed("level-table", {name: 0.02}, flat), 0.02 * (knot == 8), atol=1e-9)
 
 
 def test_a_response_looks_at_its_place_and_goes_on_beyond_the_edge() -> None:
-    for name in DESCRIPTIONS["linear-response"].amplitudes:
+    for name in TABLES["linear-response"].amplitudes:
         dy, dx = (round(float(part) / 1000 / PITCH_UM) for part in name.split("_")[1:3])
         padded = np.pad(HEIGHT, 6, mode="edge")
         there = padded[6 + dy : 6 + dy + SHAPE[0], 6 + dx : 6 + dx + SHAPE[1]]
@@ -187,7 +205,7 @@ def test_a_response_looks_at_its_place_and_goes_on_beyond_the_edge() -> None:
 
 
 def test_a_map_of_the_place_is_a_gain() -> None:
-    for name in DESCRIPTIONS["place-map"].amplitudes:
+    for name in TABLES["place-map"].amplitudes:
         i, j = (int(part[1:]) for part in name.split("_"))
         wanted = 0.1 * HEIGHT * PLACES["y"] ** i * PLACES["x"] ** j
         np.testing.assert_allclose(changed("place-map", {name: 0.1}, HEIGHT), wanted, atol=1e-12)
@@ -202,7 +220,7 @@ def test_it_acts_on_the_print_before_the_microscope_sees_it(name: str) -> None:
 def test_what_has_no_name_is_found_by_it_and_is_no_cause() -> None:
     assert all(get_effect(name) is one for name, one in NAMELESS.items())
     assert {one.knowledge for one in LAWS.values()} == {"law"}
-    assert {one.knowledge for one in DESCRIPTIONS.values()} == {"description"}
+    assert {one.knowledge for one in TABLES.values()} == {"description"}
     assert {one.knowledge for one in CATALOGUE.values()} == {"cause"}
     assert not NAMELESS.keys() & {one.name for one in screened_effects()}
     with pytest.raises(InputError, match="which exists"):

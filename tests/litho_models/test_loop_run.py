@@ -70,7 +70,7 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
-        patch.setattr(closing, "DESCRIPTIONS", {TABLE: get_effect(TABLE)})
+        patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
         result = close_loop(store, out, base=BASE, open_lock_box=True, report=said.append)
     return result, out, said
 
@@ -327,7 +327,7 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """No cause, no law, no table, and little that scans may share."""
-    for name in ("LAWS", "DESCRIPTIONS"):
+    for name in ("LAWS", "TABLES"):
         monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
     monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))

@@ -423,21 +423,21 @@ EARLY, LATE = (get_effect("slope-thinning").with_values({"along_x_um": size}) fo
 
 def by_order() -> list[PrintedScan]:
     """A loss on slopes by one strength early and another late."""
-    return planted([("slope-thinning", "order 6", {"before": EARLY, "from there on": LATE})], count=12)
+    return planted([("slope-thinning", "order 5-6", {"before": EARLY, "from there on": LATE})], count=12)
 
 
 @pytest.fixture
 def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect("slope-thinning")])
     monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+    monkeypatch.setattr(closing, "TABLES", {})
 
 
 def test_a_loop_asks_and_later_prints_answer(one_cause: None) -> None:
     """What groups differ by is known: it does not make later prints contradict each other."""
     scans = by_order()
     study = Study((), np.arange(len(scans)) % 3)
-    closed = close(scans, study.fold_of, base_model(), study, describe=False)
+    closed = close(scans, study.fold_of, base_model(), study)
     result = CloseLoop.model_construct(dataset=opened([]).dataset, single_scans=[])
     open_ = open_questions(closed, result)
     question = next(one for one in open_.questions if one.name == "slope-thinning")

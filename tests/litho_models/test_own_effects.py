@@ -43,7 +43,7 @@ def test_the_example_finds_the_effects_that_it_registers(
     names = ("vignetting", "sinking-layers")
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: list(map(get_effect, names)))
     monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+    monkeypatch.setattr(closing, "TABLES", {})
     monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))
     monkeypatch.setattr("litho_models.loop.bases.build_model", lambda *_, **__: base_model())
     monkeypatch.setattr("sys.argv", ["own_effect.py", str(store), "--out", str(out)])
