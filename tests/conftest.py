@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
+from litho_data.foundation import report
 from litho_data.foundation.faces import let_waiting_threads_sleep
 
 # Before any test loads torch.
 let_waiting_threads_sleep()
+
+# In place of a figure: half a second each, some hundreds of them.
+BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Figures are made, but drawn only for tests marked ``pictures``."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("pictures") is None:
+            patch.setattr(report, "svg_address", lambda figure: BLANK)
+        return (yield)
+
+
+def pytest_collection_finish() -> None:
+    """Modules that were loaded to collect stay: no search for garbage has to pass through them again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

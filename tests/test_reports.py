@@ -23,6 +23,7 @@ from litho_models.evaluation.benchmark import benchmark
 from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 from tests.litho_models.prints import make_scans, write_store
 
+pytestmark = pytest.mark.pictures
 # Screens of a telephone before the folded part.
 MOST_SCREENS = 6
 TINY = {

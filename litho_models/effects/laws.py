@@ -1,8 +1,8 @@
 """Laws without a name: short formulas of the height, its slopes and surroundings, the place and the order.
 
 Each is an effect like any other, with one strength, so that it is screened, fitted, judged and applied by the
-same code. It says by which formula the height departs from the model, not why. Descriptions are the same with
-many strengths: they follow whatever their covariate carries, and explain nothing.
+same code. It says by which formula the height departs from the model, not why. Tables are the same with many
+strengths: they follow whatever their covariate carries, and explain nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _COPIES_UM = {
 }
 _LAST_KNOT = 16
 _KNOTS = [f"level_{knot}_of_{_LAST_KNOT}" for knot in range(_LAST_KNOT + 1)]
-_POWERS = [f"y{i}_x{j}" for i in range(5) for j in range(5 - i) if i + j]
+_POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
 _TURN = "print and scan the same layouts turned by 90 degrees"
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
@@ -71,22 +71,21 @@ class Surface:
     def beside(self, side: str, length_um: float) -> Tensor:
         """Mean height on one side, weighted by an exponential of that length."""
         axis, sign = _SIDES[side]
-        return self._mean_of_tail(lambda fy, fx: -sign * (fx if axis == -1 else fy), length_um)
+        length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
+
+        def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+            return trailing_response(-sign * (fx if axis == -1 else fy), length, pitch) - 1
+
+        return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
     def along(self, direction: str, length_um: float) -> Tensor:
         """Mean height along a direction, to both sides, weighted by an exponential of that length."""
         along_y, along_x = _DIRECTIONS[direction]
-        # Both sides together: their phases cancel.
-        return self._mean_of_tail(lambda fy, fx: along_y * fy + along_x * fx, length_um, both=True)
-
-    def _mean_of_tail(
-        self, along: Callable[[Tensor, Tensor], Tensor], length_um: float, both: bool = False
-    ) -> Tensor:
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            tail = trailing_response(along(fy, fx), length, pitch)
-            return (tail.real if both else tail) - 1
+            # Both sides together: their phases cancel.
+            return trailing_response(along_y * fy + along_x * fx, length, pitch).real - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
@@ -204,9 +203,7 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The height times a polynomial of the place in the scan."""
     y, x = context.scan_position()
-    # By columns: a polynomial of y times a power of x.
-    factor = sum(sum(values[f"y{i}_x{j}"] * y**i for i in range(5 - j) if i + j) * x**j for j in range(5))
-    return height * (1 + factor)
+    return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 
 
 LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}

@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.cards.card import Use
 from litho_data.foundation.files import atomic_file
-from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_models.planning.designer import WORDS
 from litho_models.planning.layouts import Limits
@@ -99,19 +99,19 @@ def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], pri
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
     write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
-    CardText(
+    write_card(
+        folder,
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide what is open on {plan.dataset.name}",
         pitch_um=printing.pitch_um,
         level_height_um=printing.level_height_um,
         levels=printing.highest + 1,
         scan_size_um=(plan.field_um, plan.field_um),
-        print_pattern=PRINT_PATTERN,
-        slow_axis="y",
-        write_field_um=printing.write_field_um,
-        plan_of=plan.dataset.sha256,
-        grating_um=_grating_um(plan),
-    ).write(folder)
+        ids={"print": PRINT_PATTERN, "table": TABLE_NAME},
+        write={"slow_axis": "y", "field_um": printing.write_field_um},
+        plan={"dataset_sha256": plan.dataset.sha256},
+        grating={"period_um": _grating_um(plan)},
+    )
     plan.write(folder)
     for name, lines in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
         with atomic_file(folder / name) as temporary:

@@ -25,6 +25,7 @@ TINY = {
 }
 
 
+@pytest.mark.pictures
 def test_the_front_trades_efficiency_for_likeness(tmp_path, monkeypatch, capsys):
     words = ["hoe", "--model", "none", "--target", "ring", "--front", "0,3", "--out", str(tmp_path)]
     words += [word for path, value in TINY.items() for word in ("--set", f"{path}={value}")]

@@ -27,15 +27,9 @@ from litho_design.reliefs.task import ReliefTask
 
 ROOT = Path(__file__).parents[2]
 PRESETS = {"hoe": HologramSettings(), "lens": LensSettings(), "relief": ReliefSettings()}
-EVERY = [(task, leaf) for task, preset in PRESETS.items() for leaf in leaves(preset)]
 # Choosing another preset or kind of lens changes more than the one value.
 CHOOSE = ("variant", "task")
-
-
-def named(pairs):
-    return pytest.mark.parametrize(
-        ("task", "leaf"), pairs, ids=[f"{task}-{leaf.path}" for task, leaf in pairs]
-    )
+of_each_task = pytest.mark.parametrize("task", PRESETS)
 
 
 def other(leaf: Leaf):
@@ -69,32 +63,53 @@ def flat(content, prefix=""):
     return found
 
 
-@named(EVERY)
-def test_every_setting_is_reached_by_its_path(task, leaf):
-    value = json.loads(json.dumps(other(leaf)))
-    word = value if isinstance(value, str) else json.dumps(value)
-    before, after = printed(task), printed(task, "--set", f"{leaf.path}={word}")
-    assert after[leaf.path] == value
-    if leaf.path not in CHOOSE:
-        assert {path for path in before if before[path] != after[path]} == {leaf.path}
+def single(task):
+    """The settings that can each be another without the rest."""
+    return [leaf for leaf in leaves(PRESETS[task]) if leaf.path not in CHOOSE]
 
 
-@named([(task, leaf) for task, leaf in EVERY if leaf.options])
-def test_every_option_sets_the_field_that_states_it(task, leaf):
-    value = other(leaf)
-    for option in leaf.options:
-        assert printed(task, option, value)[leaf.path] == value
+@of_each_task
+def test_every_setting_is_reached_by_its_path(task):
+    values = {leaf.path: json.loads(json.dumps(other(leaf))) for leaf in single(task)}
+    before = flat(json.loads(PRESETS[task].model_dump_json()))
+    for path, value in values.items():
+        after = flat(json.loads(changed(PRESETS[task], {path: value}).model_dump_json()))
+        assert {one: after[one] for one in before if before[one] != after[one]} == {path: value}
+    # The command passes paths and values on as they are.
+    words = [
+        f"{path}={value if isinstance(value, str) else json.dumps(value)}" for path, value in values.items()
+    ]
+    assert printed(task) | values == printed(task, *(word for one in words for word in ("--set", one)))
 
 
-@named(EVERY)
-def test_every_setting_says_what_it_is_and_in_which_unit(task, leaf):
-    assert leaf.help
-    assert not leaf.help.endswith(".")
-    suffix = leaf.path.rpartition("_")[2]
-    assert {"um": "µm", "px": "px"}.get(suffix, leaf.unit) == leaf.unit
+@of_each_task
+def test_every_option_sets_the_field_that_states_it(task):
+    """All at once: what one of them sets elsewhere would show."""
+    given = [leaf for leaf in single(task) if leaf.options]
+    for number in range(max(len(leaf.options) for leaf in given)):
+        having = [leaf for leaf in given if len(leaf.options) > number]
+        words = [word for leaf in having for word in (leaf.options[number], other(leaf))]
+        assert printed(task) | {leaf.path: other(leaf) for leaf in having} == printed(task, *words)
 
 
-@pytest.mark.parametrize("task", PRESETS)
+@of_each_task
+def test_what_chooses_a_preset_is_reached_by_path_and_option(task):
+    for leaf in (leaf for leaf in leaves(PRESETS[task]) if leaf.path in CHOOSE):
+        value = other(leaf)
+        for words in (("--set", f"{leaf.path}={value}"), *((option, value) for option in leaf.options)):
+            assert printed(task, *words)[leaf.path] == value
+
+
+@of_each_task
+def test_every_setting_says_what_it_is_and_in_which_unit(task):
+    for leaf in leaves(PRESETS[task]):
+        assert leaf.help, leaf.path
+        assert not leaf.help.endswith("."), leaf.path
+        suffix = leaf.path.rpartition("_")[2]
+        assert {"um": "µm", "px": "px"}.get(suffix, leaf.unit) == leaf.unit, leaf.path
+
+
+@of_each_task
 def test_no_two_settings_share_an_option(task):
     options = [option for leaf in leaves(PRESETS[task]) for option in leaf.options]
     assert len(options) == len(set(options))

@@ -277,6 +277,7 @@ def test_an_error_that_the_fit_has_made_small_is_not_judged(lab, tmp_path):
     ]
 
 
+@pytest.mark.pictures
 def test_taller_prints_end_the_strict_command_with_3(lab, tmp_path, monkeypatch, capsys):
     arguments = ["check", str(lab / "model"), str(lab / "taller.zarr"), "--out", str(tmp_path / "out")]
     assert _exit_code(monkeypatch, [*arguments, "--strict"]) == 3
