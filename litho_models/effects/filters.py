@@ -102,7 +102,7 @@ def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: fl
 
 def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:
     ny, nx = field.shape[-2:]
-    y_px, x_px = torch.broadcast_tensors(y_px, x_px)
-    grid = torch.stack([2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1], dim=-1)
-    grid = grid.reshape(-1, ny, nx, 2).expand(field.shape[0], ny, nx, 2)
+    # From -1 to 1 over the field.
+    x, y = torch.broadcast_tensors(2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1)
+    grid = torch.stack([x, y], dim=-1).expand(len(field), ny, nx, 2)
     return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)

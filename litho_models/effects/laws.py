@@ -65,7 +65,8 @@ class Surface:
 
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
         """Mean nearby of a map, of the height unless given, weighted by a Gaussian."""
-        return _blurred(self.h if of is None else of, self.context, reach_um)
+        field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
+        return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
 
     def beside(self, side: str, length_um: float) -> Tensor:
         """Mean height on one side, weighted by an exponential of that length."""
@@ -91,10 +92,6 @@ class Surface:
 
 # The map that a strength multiplies, (b, 1, y, x).
 Column = Callable[[Surface], Tensor]
-
-
-def _blurred(height: Tensor, context: FieldContext, sigma_um: float) -> Tensor:
-    return add_blur(height, height.new_tensor(sigma_um**2), context.pitch_um, 4 * sigma_um)
 
 
 def _columns() -> Iterator[tuple[str, str, str, Column]]:

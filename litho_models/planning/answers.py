@@ -64,13 +64,15 @@ def of_rivals(
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
     """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
-    drawn = [rivalry.drawn(random) for _ in range(DRAWS)]
-    contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
+    powers = []
+    for _ in range(DRAWS):
+        drawn = rivalry.drawn(random)
+        shown = drawn.contrasts(prints, drawn.refitted(prints, first=first))
+        powers.append([[power.of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in shown])
     fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2))
-    directed = {}
-    for pair, contrast, *others in zip(rivalry.pairs, fitted, *contrasts, strict=True):
-        powers = [[power.of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in others]
-        directed[pair] = np.mean(powers, axis=0).tolist(), contrast
+    directed = dict(
+        zip(rivalry.pairs, zip(np.mean(powers, axis=0).tolist(), fitted, strict=True), strict=True)
+    )
     found = []
     for pair in combinations(range(len(rivalry.twins)), 2):
         mean, contrast = min((directed[pair], directed[pair[::-1]]), key=lambda one: one[0])
