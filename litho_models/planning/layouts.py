@@ -88,14 +88,15 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     """
     for number, finest in enumerate((1.0, 0.5, 0.8)):
         yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
-    levels = {"high": limits.highest, "low": limits.lowest}
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
     patterns = {
-        "checkerboard": checkerboard(shape, cell_px=2 * feature, **levels),
-        "lines": line_space_sweep(shape, narrowest_px=feature, **levels),
-        "lines-along-x": line_space_sweep(shape, narrowest_px=feature, along="x", **levels),
+        "checkerboard": checkerboard(shape, cell_px=2 * feature, high=limits.highest, low=limits.lowest),
+        "lines": line_space_sweep(shape, narrowest_px=feature, high=limits.highest, low=limits.lowest),
+        "lines-along-x": line_space_sweep(
+            shape, narrowest_px=feature, along="x", high=limits.highest, low=limits.lowest
+        ),
     }
     for name, pattern in patterns.items():
         whole = limits.random(size_px, seed + 7)

@@ -110,8 +110,9 @@ def next_print(
     ]
     report("comparing the rivals on the planned prints, and on random ones")
     judged = planned[:_JUDGED]
-    levels = [as_tensor(limits.random(size_px, seed + 101 + i)) for i in range(len(judged))]
-    random = [replace(one, level=level) for one, level in zip(judged, levels, strict=True)]
+    random = [
+        replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i))) for i, one in enumerate(judged)
+    ]
     answered = {
         rivalry.question.name: of_rivals(rivalry, choice.tried, judged, random, prints)
         for rivalry, choice in zip(rivalries, choices, strict=True)

@@ -89,7 +89,7 @@ class Products:
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
         used = {column for block in blocks for column in block.columns}
-        rest = [c for c in range(self.grams.shape[1]) if c not in used]
+        rest = np.array([c for c in range(self.grams.shape[1]) if c not in used], np.intp)
         solved = expanded.solve(rest)
         freed = np.empty_like(self.grams)
         for members, rows in expanded.alike:
@@ -133,14 +133,14 @@ class _Expanded:
         ]
         self._shrunk = np.array(shrunk)
 
-    def solve(self, targets: Sequence[int]) -> np.ndarray:
+    def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
         """Strengths (rows, targets) that come closest to these columns, or to the residual."""
-        size = len(self._shrunk)
+        size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows in self.alike:
             gram = self._grams[members].sum(axis=0)
             matrix[np.ix_(rows, rows)] += gram[np.ix_(self.columns, self.columns)]
-            right[rows] += gram[np.ix_(self.columns, targets)]
+            right[rows] += gram[np.ix_(self.columns, wanted)]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
         normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
         return np.linalg.solve(normal, right / scale) / scale
