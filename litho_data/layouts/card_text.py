@@ -56,7 +56,8 @@ def write_card(
         "levels": levels,
     }
     text = _toml({"name": name, "title": title})
-    for key, table in {"layout": layout, "scan": scan, **tables}.items():
+    all_tables: dict[str, Mapping[str, Any]] = {"layout": layout, "scan": scan, **tables}
+    for key, table in all_tables.items():
         text += f"\n[{key}]\n{_toml(table)}"
     check_card(tomllib.loads(text), "card to write")
     path = folder / CARD_NAME

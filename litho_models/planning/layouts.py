@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -91,12 +92,11 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
+    sweep = partial(line_space_sweep, shape, narrowest_px=feature, high=limits.highest, low=limits.lowest)
     patterns = {
         "checkerboard": checkerboard(shape, cell_px=2 * feature, high=limits.highest, low=limits.lowest),
-        "lines": line_space_sweep(shape, narrowest_px=feature, high=limits.highest, low=limits.lowest),
-        "lines-along-x": line_space_sweep(
-            shape, narrowest_px=feature, along="x", high=limits.highest, low=limits.lowest
-        ),
+        "lines": sweep(),
+        "lines-along-x": sweep(along="x"),
     }
     for name, pattern in patterns.items():
         whole = limits.random(size_px, seed + 7)
