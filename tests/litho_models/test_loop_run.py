@@ -229,7 +229,7 @@ def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
         found = SimpleNamespace(
             study=SimpleNamespace(scans=[None] * count),
             rests={"base": SimpleNamespace(matters=True), "all": SimpleNamespace(matters=matters)},
-            named=SimpleNamespace(refused={"one": "reason"} if refused else {}),
+            chosen=SimpleNamespace(named=SimpleNamespace(refused={"one": "reason"} if refused else {})),
         )
         return _verdict(found, [SimpleNamespace(knowledge=one) for one in knowledge])  # type: ignore[arg-type]
 
