@@ -16,7 +16,7 @@ from torch import Tensor
 
 from litho_data.foundation.commands import run_script
 from litho_models import close_loop, register_effect, register_scan_term
-from litho_models.effects import Effect, FieldContext, Parameter
+from litho_models.effects import Effect, FieldContext, Parameter, of_single_scans
 from litho_models.effects.effect import Values
 from litho_models.scan_terms import FloatMap, ScanTerm, TermPixels
 
@@ -28,14 +28,8 @@ def sinking_layers(height: Tensor, values: Values, context: FieldContext) -> Ten
     return height - values["depth_um"] * torch.exp(-context.layout_um / SINKING_DEPTH_UM)
 
 
-def cubic_bow(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + a x³, x from -1 to 1 over the scan."""
-    _, x = context.scan_position()
-    return height + values["bow_xxx_um"] * x**3
-
-
 def cubic_bow_map(pixels: TermPixels) -> FloatMap:
-    """The same as a map of zero mean, (1, n)."""
+    """x³ at the pixels, x from -1 to 1 over the scan, (1, n): of zero mean."""
     x = pixels.smooth[0]
     return (x**3)[None]
 
@@ -51,7 +45,6 @@ def register() -> None:
             acts_on="height",
             parameters={"depth_um": Parameter("µm", 0.0, 0.3, 0.03)},
             apply=sinking_layers,
-            trials=({"depth_um": 0.03},),
             source="an example",
             separating="print staircases with and without the promoter",
         )
@@ -64,10 +57,9 @@ def register() -> None:
             role="measurement",
             acts_on="height",
             parameters={"bow_xxx_um": Parameter("µm", -0.3, 0.3, 0.02)},
-            apply=cubic_bow,
+            apply=of_single_scans,
             source="an example",
             separating="scan a flat substrate",
-            per_scan=True,
         )
     )
     register_scan_term(ScanTerm("cubic-bow", "cubic-bow", "µm", ("x³",), maps=cubic_bow_map))

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.blind_trials.draws import names_of
 from benchmarks.blind_trials.other_forms import FORMS, FormCause
 from benchmarks.blind_trials.records import CauseDraw, Draw, Planted
-from litho_data.layouts.card_text import CardText, write_layout
+from litho_data.layouts.card_text import write_card, write_layout
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab import KNOBS, Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
@@ -104,17 +104,16 @@ def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folde
         write_layout(folder, job.id, job.level)
         write_text_matrix(folder / "scans" / f"{job.id}.txt", scan.height_um)
     printer = printer_of(draw)
-    CardText(
+    return write_card(
+        folder,
         name="virtual-fab",
         title="Simulated two-photon prints with simulated AFM scans",
         pitch_um=printer.pitch_um,
         level_height_um=printer.level_height_um,
         levels=printer.levels,
         scan_size_um=scan.frame.size_um,
-        table=False,
         levelled=True,
-    ).write(folder)
-    return folder / "card.toml"
+    )
 
 
 def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> list[np.ndarray]:

@@ -37,13 +37,14 @@ def main() -> None:
         order=_LAST_IN_ORDER,
     )
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
-    rows = -(-(len(CATALOGUE) + 1) // COLUMNS)
+    effects = [effect for effect in CATALOGUE.values() if not effect.per_scan]
+    rows = -(-(len(effects) + 1) // COLUMNS)
     # On the page 690 px wide, where ten points then have nine pixels.
     figure = new_figure(2.1 * COLUMNS, 2.3 * rows)
     panels = figure.subplots(rows, COLUMNS).ravel()
     panels[0].imshow(level[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX], cmap="viridis")
     panels[0].set_title("layout", fontsize=10)
-    for panel, effect in zip(panels[1:], CATALOGUE.values(), strict=False):
+    for panel, effect in zip(panels[1:], effects, strict=False):
         change = 1e3 * signature(effect, base, layout, context)
         limit = max(float(np.quantile(np.abs(change), 0.99)), 1e-3)
         panel.imshow(change, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
@@ -57,10 +58,10 @@ def signature(
     effect: Effect, base: torch.nn.Module, layout: torch.Tensor, context: FieldContext
 ) -> np.ndarray:
     """Height with the effect minus without (y, x), µm; the border, with nothing beside it, is cut off."""
-    trial = {**effect.off_values(), **(effect.trials[0] if effect.trials else {})}
+    trial = effect.with_values(effect.trials[0])
     for name in effect.amplitudes:
         parameter = effect.parameters[name]
-        if not effect.trials or name in effect.trials[0]:
+        if name in effect.trials[0]:
             wanted = parameter.null + STRENGTH * (parameter.typical - parameter.null)
             trial[name] = min(max(wanted, parameter.lower), parameter.upper)
     geometry = {"full_height_um": context.full_height_um, "pitch_um": PITCH_UM}

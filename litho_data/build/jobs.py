@@ -18,6 +18,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
+from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
@@ -189,7 +190,9 @@ class FieldJob:
         yield registered
         if self.card.process.tip is not None:
             yield made("tip", {**pitch, "radius_um": self.card.process.tip})
-        yield made("resample", {**pitches, "layout_shape": list(held["mask_level"].shape)})
+        # What lies around a field is not in its layout: its outermost pixels are no evidence.
+        aside = {"edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else {}
+        yield made("resample", {**pitches, "layout_shape": list(held["mask_level"].shape), **aside})
         fit = {name: registered.facts[name] for name in ("blur_um", "model")}
         lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(recipe["step"])}
         yield made("uncertainty", {**pitches, **fit, **lines})
@@ -202,11 +205,14 @@ class FieldJob:
         params: dict[str, Any] = {"levels": self.card.layout.levels}
         if self.card.layout.grey_per_level is not None:
             params["grey_per_level"] = self.card.layout.grey_per_level
-        write = self.card.write
-        surround = self.field.columns.get("surround") or (write.surround if write else None)
-        if surround == "substrate":
+        if self._surround == "substrate":
             params["bare_px"] = _BARE_PX
         return OPERATIONS["read-layout"].run(params, file, {})
+
+    @property
+    def _surround(self) -> str | float | None:
+        write = self.card.write
+        return self.field.columns.get("surround") or (write.surround if write else None)
 
     @property
     def _read_params(self) -> dict[str, Any]:

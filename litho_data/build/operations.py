@@ -190,6 +190,7 @@ def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
 @_operation("resample", "levelled_height_um scan_to_layout bend_um defect tip_certain", "register")
 def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.register import Bend, resample_to_layout
+    from litho_data.register.refine import interior_of
 
     levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
     bend = Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if "bend_um" in arrays else None
@@ -209,6 +210,7 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
         valid &= ~arrays["defect"]
     if "tip_certain" in arrays:
         valid &= on_layout(arrays["tip_certain"])[0] > 0.5
+    valid &= interior_of(valid.shape, params.get("edge_px", 0))
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 

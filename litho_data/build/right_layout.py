@@ -15,11 +15,14 @@ import numpy as np
 from litho_data.foundation.kinds import YX, Array
 from litho_data.register.geometry import ORIENTATIONS
 from litho_data.register.orientation import search_orientation
+from litho_data.register.refine import interior_of
 from litho_data.register.scan import at_layout_pitch
 from litho_data.register.topography import pearson, predicted_topography, remove_bow
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
+# What lies around a field shows in this many of its outermost pixels.
+_EDGE_PX = 2
 # Another layout must explain a scan this much better, in correlation.
 _BETTER = 0.02
 # Correlations by matrix products in float32 are right to this; so many scans are in one product.
@@ -37,13 +40,15 @@ class Print:
     """One registered scan: its heights and its blurred layout at a few points, and where it belongs.
 
     ``turned``: whether the card says that it lay turned. ``group`` is what should share a gain: the dose, if
-    the card gives it, or the printed block. ``response``: see ``_response``.
+    the card gives it, or the printed block. ``response`` and ``edge_times`` are those of ``_response`` and
+    ``_edge_times``.
     """
 
     id: str
     topography: Array
     height: Array
     response: tuple[float, float]
+    edge_times: float
     highest_level: int
     layout: str
     dihedral: str
@@ -101,14 +106,17 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     level = arrays["mask_level"]
     step = max(1, -(-max(level.shape) // _SIDE_PX))
     sparse = (slice(step // 2, None, step),) * 2
-    topography, height = predicted_topography(level, _BLUR_PX)[sparse], arrays["height_um"][sparse]
+    whole = predicted_topography(level, _BLUR_PX)
+    topography, height = whole[sparse], arrays["height_um"][sparse]
     dose = record["columns"].get("dose")
+    response = _response(topography, height)
     return Print(
         id=record["id"],
         # Copies: a view would keep the whole.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
-        response=_response(topography, height),
+        response=response,
+        edge_times=_edge_times(whole, arrays["height_um"], response[0]),
         highest_level=int(level.max()),
         layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
@@ -229,6 +237,21 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     square = float(np.polyfit(level, height, 2)[0]) * float((from_mean * level**2).sum())
     growth = 1 + square / slope if slope else 0.0
     return slope / max(float((from_mean**2).sum()), 1e-12), growth
+
+
+def _edge_times(topography: Array, height: Array, slope: float) -> float:
+    """How many times as far the outermost pixels lie from their layout as the others; 0 if unknown.
+
+    ``slope``: height per blurred level, µm.
+    """
+    seen = np.isfinite(height)
+    inner = seen & interior_of(height.shape, _EDGE_PX)
+    edge = seen & ~inner
+    if not inner.any() or not edge.any():
+        return 0.0
+    off = height - slope * topography
+    off = (off - off[inner].mean()) ** 2
+    return float(np.sqrt(off[edge].mean() / max(off[inner].mean(), 1e-12)))
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:

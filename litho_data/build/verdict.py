@@ -17,6 +17,8 @@ _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # Scales of the scans that agree with each other but not with 1: the pitch of the card.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
+# Measured prints lie at 1.1 to 1.5, made ones with a rim as high as the substrate at 2, without it at 6 to 8.
+_EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # What levelling left, as a share of the print's own standard deviation.
 _LEFT = 0.3
@@ -148,6 +150,14 @@ def _of_the_card(
             f"fits as {layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
         )
         yield ALL, text, Weight.PITCH
+    edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
+    if edge_times > _EDGE_TIMES:
+        text = (
+            f"their outermost pixels lie {edge_times:.0f} times as far from their layouts as the rest: set "
+            "write.surround to substrate if level 0 goes on around a field, else to unknown, which leaves "
+            "these pixels out"
+        )
+        yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
     if 2 * highest < layout.levels - 1:
         text = f"the layouts use no level above {highest:g}, layout.levels = {layout.levels}"

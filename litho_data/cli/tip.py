@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from litho_data.cli.scan import ChannelName, Format, FullScale, Size, Unit
+from litho_data.cli.scan import ChannelName, Format, FullScale, Missing, Size, Unit, marks
 from litho_data.foundation.app import argument, option
 from litho_data.foundation.errors import InputError
 
@@ -22,6 +22,7 @@ def tip(
     size_um: Size = None,
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
+    missing: Missing = None,
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,
@@ -39,7 +40,13 @@ def tip(
 
     read = [
         read_scan(
-            file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+            file,
+            format=format,
+            unit=unit,
+            size_um=size_um,
+            channel=channel,
+            full_scale_um=full_scale_um,
+            missing=marks(missing),
         )
         for file in scans
     ]

@@ -3,9 +3,9 @@
 import csv
 import json
 import tomllib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from litho_data.cards.card import check_card
 from litho_data.foundation.kinds import YX, Array
@@ -14,89 +14,60 @@ CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"
 
 
-@dataclass(frozen=True)
-class CardText:
-    """What a card says about a set of layouts and their scans.
+def write_card(
+    folder: Path,
+    *,
+    name: str,
+    title: str,
+    pitch_um: float,
+    level_height_um: float,
+    levels: int,
+    scan_size_um: YX,
+    scan_format: str = "text-matrix",
+    levelled: bool = False,
+    **tables: Mapping[str, Any],
+) -> Path:
+    """Write the card of layouts in ``layouts`` and of their scans, which are or will be in ``scans``.
 
     Args:
-        name: name of the dataset.
-        title: one line for people.
-        pitch_um: pitch of the layouts, µm.
-        level_height_um: nominal height of one level, µm.
-        levels: number of levels.
-        scan_size_um: (y, x) extent of a scan, µm.
-        print_pattern: regular expression with a group ``print``, or empty.
-        table: whether a table lies beside the card.
-        slow_axis: axis across the hatch lines, or empty if it is not stated.
-        write_field_um: side of the write field, µm, or None if it is not stated.
-        plan_of: hash of the dataset that the layouts were planned from, or empty.
-        scan_format: of the files of the microscope.
-        grating_um: period of the grating that scans of this use show, or None.
+        folder: where the card goes.
+        name: of the dataset; ``title``: one line for people.
+        pitch_um: of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
+        scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: of the files of the microscope.
         levelled: whether a build is to take the heights as they are in the files.
+        tables: further ones of the card, such as ``ids`` and ``write``; None is not written.
+
+    Raises:
+        InputError: a value that a card may not have.
     """
+    plain = scan_format == "text-matrix"  # the others state unit and size
+    scan = {
+        "files": f"scans/{{id}}.{'txt' if plain else scan_format}",
+        "format": scan_format,
+        "unit": "m" if plain else None,
+        "size_um": [round(side, 9) for side in scan_size_um] if plain else None,
+        "fast_axis": "x",
+        "levelled": levelled or None,
+    }
+    layout = {
+        "files": "layouts/{id}.tif",
+        "pitch_um": float(pitch_um),
+        "level_height_um": float(level_height_um),
+        "levels": levels,
+    }
+    text = _toml({"name": name, "title": title})
+    for key, table in {"layout": layout, "scan": scan, **tables}.items():
+        text += f"\n[{key}]\n{_toml(table)}"
+    check_card(tomllib.loads(text), "card to write")
+    path = folder / CARD_NAME
+    path.write_text(text, encoding="utf-8")
+    return path
 
-    name: str
-    title: str
-    pitch_um: float
-    level_height_um: float
-    levels: int
-    scan_size_um: YX
-    print_pattern: str = ""
-    table: bool = True
-    slow_axis: str = ""
-    write_field_um: float | None = None
-    plan_of: str = ""
-    scan_format: str = "text-matrix"
-    grating_um: float | None = None
-    levelled: bool = False
 
-    def toml(self) -> str:
-        """The card's text."""
-        lines = [
-            f"name = {json.dumps(self.name)}",
-            f"title = {json.dumps(self.title, ensure_ascii=False)}",
-            "",
-            "[layout]",
-            'files = "layouts/{id}.tif"',
-            f"pitch_um = {float(self.pitch_um)}",
-            f"level_height_um = {float(self.level_height_um)}",
-            f"levels = {self.levels}",
-            "",
-            "[scan]",
-            f'files = "scans/{{id}}.{"txt" if self.scan_format == "text-matrix" else self.scan_format}"',
-            f'format = "{self.scan_format}"',
-        ]
-        if self.scan_format == "text-matrix":
-            # The others state both.
-            size_y, size_x = (round(side, 9) for side in self.scan_size_um)
-            lines += ['unit = "m"', f"size_um = [{size_y}, {size_x}]"]
-        lines += ['fast_axis = "x"', *["levelled = true"] * self.levelled]
-        if self.print_pattern or self.table:
-            lines += ["", "[ids]"]
-            lines += [f"print = '{self.print_pattern}'"] * bool(self.print_pattern)
-            lines += [f"table = {json.dumps(TABLE_NAME)}"] * self.table
-        if self.slow_axis or self.write_field_um is not None:
-            lines += ["", "[write]"]
-            lines += [f'slow_axis = "{self.slow_axis}"'] * bool(self.slow_axis)
-            if self.write_field_um is not None:
-                lines.append(f"field_um = {float(self.write_field_um)}")
-        if self.plan_of:
-            lines += ["", "[plan]", f"dataset_sha256 = {json.dumps(self.plan_of)}"]
-        if self.grating_um is not None:
-            lines += ["", "[grating]", f"period_um = {float(self.grating_um)}"]
-        return "\n".join(lines) + "\n"
-
-    def write(self, folder: Path) -> Path:
-        """Write the card into ``folder``.
-
-        Raises:
-            InputError: a value that a card may not have.
-        """
-        path = folder / CARD_NAME
-        text = self.toml()
-        check_card(tomllib.loads(text), "card to write")
-        path.write_text(text, encoding="utf-8")
-        return path
+def _toml(table: Mapping[str, Any]) -> str:
+    # Strings, numbers, truth and lists of them are written alike in JSON and in TOML.
+    said = {key: value for key, value in table.items() if value is not None}
+    return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in said.items())
 
 
 def write_layout(folder: Path, scan_id: str, level: Array) -> Path:

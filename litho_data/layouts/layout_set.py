@@ -10,7 +10,7 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.kinds import Array, Shape
-from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
+from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
     flat,
@@ -112,14 +112,16 @@ def write_layout_set(
             paths.append(write_layout(folder, layout.id, layout.level))
             rows.append((layout.id, len(rows), f"{layout.dose:.10g}", layout.use))
         write_table(folder, ("id", "order", "dose", "use"), rows)
-        CardText(
+        write_card(
+            folder,
             name=f"{pattern}-layouts",
             title=f"Layouts: {meaning}",
             pitch_um=pitch_um,
             level_height_um=level_height_um,
             levels=levels,
             scan_size_um=(shape[0] * pitch_um, shape[1] * pitch_um),
-        ).write(folder)
+            ids={"table": TABLE_NAME},
+        )
         statistics = layout_statistics(paths, levels=levels, pitch_um=pitch_um)
         statistics = statistics.model_copy(update={"settings": made})
         statistics.write(folder)

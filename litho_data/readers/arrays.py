@@ -22,8 +22,12 @@ _MISSING = ("_FillValue", "missing_value")
 _RANGE = ("valid_min", "valid_max", "valid_range")
 # Other attributes with numbers that would change the values, if one knew how.
 _UNKNOWN = re.compile(
-    r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb", re.I
+    r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb|sensitiv|"
+    r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
+    re.I,
 )
+# Numbers that make heights of counts, as in m counts + b.
+_OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
 # The same beside an array or above it, where many other numbers stand.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
@@ -41,11 +45,15 @@ _NO_COORDINATE = b"This is a netCDF dimension but not"
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Positions along one dimension and the unit that the file states, or a stated length alone."""
+    """Positions along one dimension and the unit that the file states, or a stated length alone.
+
+    ``axis``: which one it is, if the file says so apart from its name.
+    """
 
     values: Array | None
     unit: str | None
     length: float | None = None
+    axis: str = ""
 
     def extent(self, count: int) -> float | None:
         """From edge to edge; None if it is not known.
@@ -84,7 +92,8 @@ def array_channel(
     """
     says = {key: _plain(value) for key, value in attributes.items()}
     beside = {key: _plain(value) for key, value in (around or {}).items()}
-    unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value)]
+    counts = dtype.kind in "ui"
+    unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value, counts)]
     unknown += [
         f"{key} = {value}"
         for key, value in beside.items()
@@ -118,7 +127,7 @@ def array_channel(
         unit=str(unit) if unit not in (None, "", "1") else None,
         size_um=size_um,
         load=partial(_values, raw, says, turned, mirrored),
-        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" and not scaled else None,
+        full_scale=float(np.iinfo(dtype).max) if counts and not scaled else None,
         header={key: str(value) for key, value in says.items()},
         x_is=f"the {'first' if turned else 'second'} index" + (f", {x}" if x else ""),
         extent=extent,
@@ -132,9 +141,8 @@ def _axes(
 
     Dimensions without coordinates take those of their lengths that are called x and y.
     """
-    turned = bool(
-        (_X.match(dims[0]) and not _X.match(dims[1])) or (_Y.match(dims[1]) and not _Y.match(dims[0]))
-    )
+    first, second = ((known[dim].axis if dim in known else "") or dim for dim in dims)
+    turned = bool((_X.match(first) and not _X.match(second)) or (_Y.match(second) and not _Y.match(first)))
     if not any(dim in known for dim in dims):
         lengths = {name: len(one.values) for name, one in known.items() if one.values is not None}
         y, x = (next((name for name in lengths if axis.match(name)), "") for axis in (_Y, _X))
@@ -144,9 +152,10 @@ def _axes(
     return (dims[1], dims[0]) if turned else dims, turned
 
 
-def _changes(key: str, value: Any) -> bool:
-    number = isinstance(value, int | float | Array | list)
-    return key not in (*_APPLIED, *_MISSING, *_RANGE) and number and bool(_UNKNOWN.search(key))
+def _changes(key: str, value: Any, counts: bool) -> bool:
+    if key in (*_APPLIED, *_MISSING, *_RANGE) or not isinstance(value, int | float | Array | list):
+        return False
+    return bool(_UNKNOWN.search(key) or (counts and _OF_COUNTS.fullmatch(key)))
 
 
 def _plain(value: Any) -> Any:
@@ -183,11 +192,23 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
     )
     matlab = b"MATLAB" in path.open("rb").read(16)
     maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
-    named = [(item.name.strip("/"), partial(_hdf5_channel, path, item, matlab)) for item in maps]
+    masks = {item.shape: item.name for item in datasets if item.dtype.kind == "b"}
+    named = [(item.name.strip("/"), partial(_hdf5_channel, path, item, matlab, masks)) for item in maps]
     return _channels(path, "HDF5", iter(named))
 
 
-def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
+def refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
+    """Refuse a map with a mask beside it, whose meaning is not known.
+
+    Raises:
+        InputError: so it is.
+    """
+    if shape in masks:
+        raise InputError(f"mask {masks[shape]!r}", wanted="NaN where pixels were not measured, and no mask")
+
+
+def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str]) -> Channel:
+    refuse_mask(item.shape, masks)
     raw = partial(_dataset, path, item.name)
     scales = [list(item.dims[axis].values()) for axis in (0, 1)]
     dims = [
@@ -242,10 +263,12 @@ def _coordinate(values: Array, attributes: Mapping[str, Any]) -> Coordinate:
     unit = attributes.get("units", attributes.get("unit"))
     length = attributes.get("length")
     numbers = np.asarray(values, dtype=float) if np.asarray(values).dtype.kind in _NUMBERS else None
+    axis = str(_plain(attributes.get("axis", attributes.get("standard_name", ""))))
     return Coordinate(
         numbers,
         None if unit is None else str(_plain(unit)),
         None if length is None else float(_plain(length)),
+        axis.removeprefix("projection_"),
     )
 
 

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, about
 from litho_data.foundation.kinds import YX, Array
 from litho_data.readers.reader import Channel, Reader, extent_um
+from litho_data.readers.text_blocks import refuse_scales
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
 _ITEM = 4
@@ -17,13 +18,15 @@ def read_channels(path: Path) -> list[Channel]:
     """The one field of a GSF file; unit and size only if the header states them.
 
     Raises:
-        InputError: another format, a header without XRes and YRes, or data of another length.
+        InputError: another format, a header without XRes and YRes or with a scale, or data of another length.
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
         raise InputError(f"{path} is no Gwyddion Simple Field", got=repr(raw[:25]), wanted=repr(_MAGIC))
     header_end = raw.find(b"\0")
     header = _parse_header(path, raw[len(_MAGIC) : header_end if header_end >= 0 else None])
+    with about(str(path)):
+        refuse_scales(header)
     shape = (_count(path, header, "YRes"), _count(path, header, "XRes"))
     # At least one NUL, even if the header already ends on a multiple of four.
     start = (header_end // _ITEM + 1) * _ITEM

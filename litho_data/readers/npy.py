@@ -1,7 +1,6 @@
 """NumPy arrays in ``.npy`` and ``.npz`` files; pickled objects are refused."""
 
 import zipfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -9,13 +8,13 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array, Shape
+from litho_data.readers.arrays import Coordinate, array_channel, refuse_mask
 from litho_data.readers.reader import (
     MOST_BYTES_PER_PACKED_BYTE,
     Channel,
-    Loaded,
     Reader,
     foreign_parser,
-    in_memory,
+    one_by_one,
 )
 
 _ZIP_MAGIC = b"PK\x03\x04"
@@ -35,16 +34,20 @@ def read_channels(path: Path) -> list[Channel]:
     array = load_array(path)
     if array.ndim != 2:
         raise InputError(f"{path}: shape", got=array.shape, wanted="two dimensions (ny, nx)")
-    return [_channel("array", array.shape, array.dtype, in_memory(array))]
+    return [array_channel("array", array.dtype, array.shape, partial(np.array, array), {})]
 
 
 def read_archive(path: Path) -> list[Channel]:
     """One channel per two-dimensional array of numbers in an ``.npz`` file; others are passed over.
 
+    Single values and lines beside them tell the unit and the axes, as in a file of MATLAB.
+
     Raises:
-        InputError: damaged file, or no such array.
+        InputError: damaged file.
     """
-    channels = []
+    maps: dict[str, tuple[Shape, np.dtype]] = {}
+    masks: dict[Shape, str] = {}
+    beside: dict[str, Array] = {}
     with foreign_parser(path, "NPZ"), zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             with archive.open(member) as stream:
@@ -52,27 +55,30 @@ def read_archive(path: Path) -> list[Channel]:
                 whole = stream.tell() + np.prod(shape, dtype=float) * dtype.itemsize == member.file_size
             if not whole or member.file_size > MOST_BYTES_PER_PACKED_BYTE * member.compress_size:
                 raise InputError(f"{path}: {member.filename}", got=f"{member.file_size} bytes", wanted=shape)
+            name = member.filename.removesuffix(".npy")
             if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
-                name = member.filename.removesuffix(".npy")
-                channels.append(_channel(name, shape, dtype, partial(_load_member, path, name)))
-    return channels
+                maps[name] = shape, dtype
+            elif dtype.kind == "b":
+                masks[shape] = name
+            elif len(shape) < 2 and not dtype.hasobject:
+                beside[name] = _member(path, name)
+    numbers = {name: one for name, one in beside.items() if one.size > 1 and one.dtype.kind in "uif"}
+    lines = {name: Coordinate(one, None) for name, one in numbers.items()}
+    around = {name: one.item() for name, one in beside.items() if one.size == 1}
+
+    def channel(name: str) -> Channel:
+        shape, dtype = maps[name]
+        refuse_mask(shape, masks)
+        return array_channel(
+            name, dtype, shape, partial(_member, path, name), {}, coordinates=lines, around=around
+        )
+
+    return [one_by_one(path, "NPZ", name, partial(channel, name)) for name in maps]
 
 
-def _load_member(path: Path, name: str) -> Loaded:
+def _member(path: Path, name: str) -> Array:
     with foreign_parser(path, "NPZ"), np.load(path, allow_pickle=False) as archive:
-        return archive[name], None
-
-
-def _channel(name: str, shape: Shape, dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
-    return Channel(
-        name=name,
-        shape=shape,
-        unit=None,
-        size_um=None,
-        load=load,
-        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" else None,
-        header={"dtype": str(dtype)},
-    )
+        return archive[name]
 
 
 def load_array(path: Path) -> Array:

@@ -1,5 +1,6 @@
 """Reading one scan: format, channel, unit and size are decided here, in one place for all formats."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ from litho_data.readers.reader import (
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
+_NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
 # Sides of a scan that coordinates without a unit may have.
@@ -123,7 +125,13 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
             raise InputError(f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED)
-    return channels
+    return [_with_unit_of_name(one) for one in channels]
+
+
+def _with_unit_of_name(channel: Channel) -> Channel:
+    """A name may state the unit, as ``height_nm`` does."""
+    ends = _NAMED_UNIT.search(channel.name)
+    return replace(channel, unit=ends[1]) if ends and channel.unit is None else channel
 
 
 def _settle_format(file: Path, format: str) -> Reader:

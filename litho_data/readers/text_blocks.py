@@ -2,7 +2,7 @@
 
 import codecs
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,36 +28,39 @@ _FEWEST_NULS = 0.8
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
-# The words of other programs, in the languages of their users.
-_WIDTHS = ("width", "breite", "largeur", "larghezza", "ancho", "anchura", "šířka", "x-length", "x range")
-_HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška", "y-length", "y range")
-_CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channel name")
-_UNITS = ("value units", "value unit", "einheiten", "unités", "unità valore", "unidades de valor",
-          "jednotky hodnot", "z-unit", "z unit", "zunit", "z units", "data unit", "data units", "height unit",
-          "height units", "unit", "units", "einheit", "единицы измерения", "値の単位", "값 단위")  # fmt: skip
+# The words of other programs, in the languages of their users; letters and digits alone are compared.
+_NO_LETTER = re.compile(r"[\W_]+")
+_WIDTHS = ("width", "breite", "largeur", "larghezza", "ancho", "anchura", "šířka", "xlength", "xrange")
+_HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška", "ylength", "yrange")
+_CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channelname")
+_UNITS = ("valueunits", "valueunit", "einheiten", "unités", "unitàvalore", "unidadesdevalor",
+          "jednotkyhodnot", "zunit", "zunits", "dataunit", "dataunits", "heightunit", "heightunits",
+          "unitofheight", "unitsofheight", "unitofheights", "unitsofheights", "unit", "units", "einheit",
+          "единицыизмерения", "値の単位", "값단위")  # fmt: skip
+# What heights are not measured in.
+_NO_LENGTHS = {"V", "mV", "A", "nA", "pA", "N", "nN", "deg", "°", "rad", "Hz", "kHz", "%", "a.u."}
 # The unit of a column or of all numbers, as in "Height [nm]"; before a number it is that of a length.
 _TITLED = re.compile(
-    r"\b(?:z|heights?|topography|höhe|hauteur|altura|altezza)\b\s*(?>(?:in\s+|[\[(]\s*)([^\])\s:=]{1,12})[\])]?)"
+    r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
+    r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
     r"(?!\s*[:=\t;,]\s*[-\d])",
     re.IGNORECASE,
 )
 _PIXELS = (
-    ("nrows", "rows", "y-pixels", "yres", "ny", "vertical"),
-    ("ncols", "cols", "columns", "x-pixels", "xres", "nx", "horizontal"),
+    ("nrows", "rows", "ypixels", "yres", "ny", "vertical"),
+    ("ncols", "cols", "columns", "xpixels", "xres", "nx", "horizontal"),
 )
-_MISSING = (
-    "nodata_value",
-    "nodata value",
-    "nodata",
-    "no data",
-    "missing value",
-    "invalid value",
-    "void pixels",
-)
+_MISSING = ("nodatavalue", "nodata", "missingvalue", "invalidvalue", "voidpixels")
 _TO_METRES = "height conversion factor (-> m)"
 _SCALES = re.compile(
     r"bit2nm|(scale|conversion|calibration)[ _-]?factor|^(multiplier|scale|factor|lsb)\b|"
     r"(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
+)
+# A scale in prose: "multiply by 10", "heights in 0.1 nm".
+_SCALE_IN_WORDS = re.compile(
+    r"\b(multipl(y|ied)|divided?) by\b|\b(counts?|digits?|bits?|lsb)\s*=\s*\d[\d.e-]* ?([nuµμ]?m|Å)\b|"
+    r"\b(z|heights?|values?|data)\b.{0,8}(\bin|\bx|[×*]) ?(?!1 )\d[\d.e^-]* ?([nuµμ]?m|Å)\b",
+    re.IGNORECASE,
 )
 
 
@@ -71,8 +74,8 @@ class Block:
     rows: list[str] = field(default_factory=list)
 
     def first(self, names: tuple[str, ...]) -> str:
-        """What the header says under the first of these keys, in any case; empty if nothing."""
-        lower = {key.lower(): value for key, value in self.header.items()}
+        """What the header says under the first of these keys, by their letters; empty if nothing."""
+        lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
         return next((lower[name] for name in names if name in lower), "")
 
     @property
@@ -85,8 +88,10 @@ class Block:
         """Of the values; None if the header states none."""
         if self.factor is not None:
             return "m"
-        titled = [unit for text in self.words for unit in _TITLED.findall(text[:200]) if is_length(unit)]
-        return self.first(_UNITS).strip("[]() ") or next(iter(titled), None)
+        titled = [unit for text in self.words for unit in _TITLED.findall(text[:200])]
+        lengths = [unit for unit in titled if is_length(unit)]
+        others = [unit for unit in titled if unit in _NO_LENGTHS]
+        return self.first(_UNITS).strip("[]() ") or next(iter(lengths + others), None)
 
     def require_pixels(self, shape: Shape) -> None:
         """Compare the numbers of rows and columns with what the header states.
@@ -106,12 +111,14 @@ class Block:
         Raises:
             InputError: the header gives another scale, which is not known here.
         """
-        stated = {key: value for key, value in self.header.items() if NUMBER.match(value)}
-        if _TO_METRES in stated:
-            return number(stated[_TO_METRES])
-        for key, value in stated.items():
-            if _SCALES.search(key.lower()) and number(value) not in (0.0, 1.0):
-                raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
+        if NUMBER.match(self.header.get(_TO_METRES, "")):
+            return number(self.header[_TO_METRES])
+        refuse_scales(self.header)
+        for text in self.words:
+            if _SCALE_IN_WORDS.search(text[:200]):
+                raise InputError(
+                    "a scale in the header", got=repr(text[:60]), wanted="heights in a plain unit"
+                )
         return None
 
     @property
@@ -122,10 +129,21 @@ class Block:
 
     def size_um(self, shape: Shape) -> YX | None:
         """From the two sides, or from the size of a pixel."""
-        if pitch := _length_um(self.first(("pixel size", "xycalibration", "xy calibration"))):
+        if pitch := _length_um(self.first(("pixelsize", "xycalibration"))):
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(names)) for names in (_HEIGHTS, _WIDTHS)]
         return (sides[0], sides[1]) if sides[0] and sides[1] else None
+
+
+def refuse_scales(header: Mapping[str, str]) -> None:
+    """Refuse a header with a scale, which no format of these words gives.
+
+    Raises:
+        InputError: it has one.
+    """
+    for key, value in header.items():
+        if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):
+            raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
 
 
 def read_text(path: Path) -> str:

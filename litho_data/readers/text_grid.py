@@ -46,7 +46,8 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
     a map are alike. Numbers of 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing of lengths.
 
     Raises:
-        InputError: a first row and column that look like coordinates at uneven steps.
+        InputError: a first row and column that look like coordinates at uneven steps, a last row and column
+            that look like coordinates.
     """
     body = values[1:, 1:]
     if min(body.shape) <= _FEWEST_STEPS:
@@ -67,6 +68,9 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
     pairs = ((row, body[0]), (column, body[:, 0]))
     if all(len(line) >= _FEWEST_ALONE and _rises(line) and not _rises(beside) for line, beside in pairs):
         raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even ones")
+    ends = ((values[-1, :-1], values[-2, :-1]), (values[:-1, -1], values[:-1, -2]))
+    if all((step := _spacing(line)) and not _goes_on(beside, step) for line, beside in ends):
+        raise InputError("axes in the last row and column", wanted="them in the first ones, or left out")
     return Map(values)
 
 

@@ -17,6 +17,7 @@ _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")
 _AROUND_COMMA = re.compile(r"(?<![ \t])[ \t]*,[ \t]*(?=[^\s,]|\n|$)")
 _OTHER_SEPARATOR = re.compile(r"[^\s;,][;\t ]+[^\s;,]")
 _AT_COMMA, _WHOLE = re.compile(r"(\d*),(\d*)"), re.compile(r"(?<![\d,])\d+(?![\d,])")
+_THOUSANDS = re.compile(r"-?\d{1,3}( \d{3})+([.,]\d*)?")
 _SHOWN_CHARACTERS, _SHOWN_ROWS = 40, 2
 _TRUNCATED = "the file may be truncated"
 
@@ -103,6 +104,9 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
                     wanted="no marks of thousands",
                 )
             text = text.replace(",", ".")
+    if "\t" in text and all(_THOUSANDS.fullmatch(cell.strip()) for cell in re.split(r"[\t\n]", text) if cell):
+        got = repr(text[:_SHOWN_CHARACTERS])
+        raise InputError(f"{path} line {first_line}", got=got, wanted="no marks of thousands")
     if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):
         separator = "\t"
     return text, separator

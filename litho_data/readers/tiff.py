@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -141,7 +142,7 @@ def _calibration(
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
-        header = header_of(str(page.description))
+        header = header_of(_plain_text(str(page.description)))
         scale, unit = header.factor or 1.0, header.unit
     if "c0" in imagej or "c1" in imagej or int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE:
         if int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE or "c2" in imagej:
@@ -158,6 +159,14 @@ def _calibration(
     if _GDAL_NODATA in page.tags:
         missing = float(str(page.tags[_GDAL_NODATA].value).strip("\0 "))
     return scale, offset, unit, missing
+
+
+def _plain_text(description: str) -> str:
+    """A description as lines of keys and values, also where it is JSON."""
+    try:
+        return "\n".join(f"{key}: {value}" for key, value in json.loads(description).items())
+    except (ValueError, AttributeError):  # no JSON, or no object
+        return description
 
 
 def _plain_unit(unit: Any) -> str:

@@ -22,7 +22,7 @@ from litho_data.roughness.levelling_bias import (
     retained_variance,
     retained_variance_by_rows,
 )
-from litho_data.roughness.noise import NoiseSplit, PrintRoughness, print_roughness, split_noise, white_noise
+from litho_data.roughness.noise import white_noise
 from litho_data.roughness.spectrum import Spectrum, psd_along, psd_radial
 from litho_data.roughness.step_height import StepHeight, find_step, groove_depth, stair_steps
 from litho_data.roughness.texture import LineDirection, LinePeriod, line_direction, line_period
@@ -32,8 +32,6 @@ __all__ = [
     "ArealParameters",
     "LineDirection",
     "LinePeriod",
-    "NoiseSplit",
-    "PrintRoughness",
     "Scale",
     "Spectrum",
     "StepHeight",
@@ -55,12 +53,10 @@ __all__ = [
     "line_direction",
     "line_period",
     "low_pass",
-    "print_roughness",
     "psd_along",
     "psd_radial",
     "retained_variance",
     "retained_variance_by_rows",
-    "split_noise",
     "sq_uncertainty_nm",
     "stair_steps",
     "white_noise",

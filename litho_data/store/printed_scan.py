@@ -35,8 +35,9 @@ class PrintedScan:
             NaN where not valid, None if the store has none.
         groups: what the card's pattern of ids says beside the print, such as the field; by name.
         instrument: that scanned it, if the card's table names it.
-        surround: what lies around the printed field: ``substrate`` (bare), ``continues`` (more of the print)
-            or ``unknown``, if the card does not say.
+        surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 shows),
+            ``continues`` (more of the print, so that the outermost pixels are not valid) or ``unknown``,
+            also if the card does not say.
     """
 
     id: str

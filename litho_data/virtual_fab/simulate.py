@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.foundation.kinds import Shape
-from litho_data.layouts.card_text import CARD_NAME, CardText, write_layout, write_table
+from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
@@ -124,30 +124,29 @@ def simulate(
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
-        card = CardText(
+        tables: dict[str, dict[str, Any]] = {}
+        if metadata == "full":
+            _write_table(raw, rows)
+            in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
+            tables["ids"] = {"print": print_pattern if in_prints else None, "table": TABLE_NAME}
+            tables["write"] = {"slow_axis": "y", "field_um": job.write_field_um}
+            if job.grating_um is not None:
+                tables["grating"] = {"period_um": job.grating_um}
+        if plan_of:
+            tables["plan"] = {"dataset_sha256": plan_of}
+        write_card(
+            raw,
             name=name,
             title="Simulated two-photon prints with simulated AFM scans",
             pitch_um=fab.printer.pitch_um,
             level_height_um=fab.printer.level_height_um,
             levels=fab.printer.levels,
             scan_size_um=scan.frame.size_um,
-            table=metadata == "full",
-            plan_of=plan_of,
             scan_format=fab.microscope.files,
             # Tilt and bow are among the effects that are planted.
             levelled=True,
+            **tables,
         )
-        if card.table:
-            _write_table(raw, rows)
-            in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
-            card = replace(
-                card,
-                print_pattern=print_pattern if in_prints else "",
-                slow_axis="y",
-                write_field_um=job.write_field_um,
-                grating_um=job.grating_um,
-            )
-        card.write(raw)
         Truth(**facts, scans=scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
 

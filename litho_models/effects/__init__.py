@@ -1,6 +1,6 @@
 """The catalogue of effects: named, differentiable, off at their null value."""
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter
+from litho_models.effects.effect import Effect, FieldContext, Parameter, of_single_scans
 from litho_models.effects.registry import (
     CATALOGUE,
     UNTESTABLE,
@@ -18,6 +18,7 @@ __all__ = [
     "Parameter",
     "get_effect",
     "in_forward_order",
+    "of_single_scans",
     "register_effect",
     "screened_effects",
 ]

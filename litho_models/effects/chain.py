@@ -42,7 +42,6 @@ class EffectChain(nn.Module):
         self.scan_frame = frozenset(scan_frame)
         self.print_frame = frozenset(print_frame)
         self.names = tuple(in_forward_order(list(effects)))
-        self.fitted: list[tuple[str, str]] = []
         for name in self.names:
             effect = get_effect(name)
             for parameter, value in effect.with_values(effects[name]).items():
@@ -51,7 +50,6 @@ class EffectChain(nn.Module):
                     self.register_buffer(_key(name, parameter), tensor)
                 else:
                     self.register_parameter(_key(name, parameter), nn.Parameter(tensor))
-                    self.fitted.append((name, parameter))
 
     @property
     def tile(self) -> Tile | None:
@@ -74,38 +72,16 @@ class EffectChain(nn.Module):
     def values(self) -> dict[str, dict[str, float]]:
         """Parameter values of all effects as numbers."""
         return {
-            name: {
-                parameter: float(tensor.detach())
-                for parameter, tensor in self._tensors(get_effect(name)).items()
-            }
+            name: {key: float(one.detach()) for key, one in self._tensors(get_effect(name)).items()}
             for name in self.names
         }
-
-    def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
-        """The same base (shared, not copied) with other effects."""
-        return self._like_this(self.base, effects)
-
-    def over(self, base: nn.Module) -> EffectChain:
-        """The same effects over another base."""
-        return self._like_this(base, self.values())
-
-    def _like_this(self, base: nn.Module, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
-        return EffectChain(
-            base,
-            effects,
-            full_height_um=self.full_height_um,
-            pitch_um=self.pitch_um,
-            scan_frame=self.scan_frame,
-            print_frame=self.print_frame,
-        )
 
     def _run_stage(self, acts_on: str, field: Tensor, context: FieldContext) -> Tensor:
         for name in self.names:
             effect = get_effect(name)
             if effect.acts_on == acts_on:
-                scanned = effect.stage == "measurement" or name in self.scan_frame
-                scanned = scanned and name not in self.print_frame
-                apply = effect.as_scanned if scanned else effect.apply
+                turns = effect.stage == "measurement" or name in self.scan_frame
+                apply = effect.as_scanned if turns and name not in self.print_frame else effect.apply
                 field = apply(field, self._tensors(effect), context)
         return field
 

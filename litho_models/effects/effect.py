@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from itertools import product
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -37,6 +38,7 @@ class Parameter:
             without meaning while the amplitudes are null; ``choice`` is a shape that takes few
             values (a direction) and is never fitted.
         null: the amplitude's value at which the effect is the identity.
+        tried: values that screening tries; ``typical`` if there are none.
     """
 
     unit: str
@@ -45,6 +47,7 @@ class Parameter:
     typical: float
     kind: Kind = "amplitude"
     null: float = 0.0
+    tried: tuple[float, ...] = ()
 
     @property
     def off(self) -> float:
@@ -67,13 +70,11 @@ class FieldContext:
         order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
         scan_shape: (rows, columns) of the whole scan where this field is a part of it.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        scan_line: index of the scan line under each pixel (y, x), None for the rows of the array.
         quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
         backward: the scan lines were recorded on the way back.
         new_tip: scanned with another tip than the rest, a sharp one.
         pixel_size: of the scan, relative to the rest: what lags in time goes with it.
         dose: of the print, relative to the recipe's; ``layout_um`` holds it already.
-        seed: decides the draws of random effects where one is planted.
     """
 
     layout_um: Tensor
@@ -86,8 +87,6 @@ class FieldContext:
     order: float = 0.0
     scan_shape: tuple[int, int] | None = None
     origin_px: tuple[int, int] = (0, 0)
-    scan_line: Tensor | None = None
-    seed: int = 0
     quarter_turns: int = 0
     backward: bool = False
     new_tip: bool = False
@@ -98,29 +97,23 @@ class FieldContext:
         """The same field as the microscope saw it, its fast axis along x."""
         if not self.quarter_turns % 4:
             return self
-        shape, (top, left) = self.layout_um.shape[-2:], self.origin_px
-        below = self.whole_shape()[0] - top - shape[0]
-        right = self.whole_shape()[1] - left - shape[1]
+        (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
+        below, right = whole[0] - top - ny, whole[1] - left - nx
         corners = [(top, left), (right, top), (below, right), (left, below)]
         turn = self.quarter_turns % 4
         return replace(
             self,
             layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),
-            scan_shape=self.whole_shape()[::-1] if turn % 2 else self.whole_shape(),
+            scan_shape=whole[::-1] if turn % 2 else whole,
             origin_px=corners[turn],
-            scan_line=None if self.scan_line is None else torch.rot90(self.scan_line, turn),
             quarter_turns=0,
         )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
         """(y, x) of each pixel from the centre of the write field: shapes (y, 1) and (1, x), µm."""
-        y, x = (
-            (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) - (n - 1) / 2)
-            * self.pitch_um
-            + centre
-            for n, centre in zip(self.layout_um.shape[-2:], self.field_centre_um, strict=True)
-        )
-        return y[:, None], x[None, :]
+        rows, columns = self._pixels()
+        (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
+        return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
 
     def whole_shape(self) -> tuple[int, int]:
         """(rows, columns) of the whole scan."""
@@ -128,15 +121,14 @@ class FieldContext:
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
         """(y, x) of each pixel from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
-        y, x = (
-            2
-            * (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) + start)
-            / max(whole - 1, 1)
-            - 1
-            for n, start, whole in zip(
-                self.layout_um.shape[-2:], self.origin_px, self.whole_shape(), strict=True
-            )
-        )
+        rows, columns = self._pixels()
+        (ny, nx), (top, left) = self.whole_shape(), self.origin_px
+        return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
+
+    def _pixels(self) -> tuple[Tensor, Tensor]:
+        """Row and column of each pixel, shapes (y, 1) and (1, x)."""
+        layout = self.layout_um
+        y, x = (torch.arange(n, dtype=layout.dtype, device=layout.device) for n in layout.shape[-2:])
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
@@ -145,15 +137,13 @@ class FieldContext:
             return self.field_radius_um
         return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
 
-    def line(self) -> Tensor:
-        """Scan line of each pixel from 0, shape (y, x)."""
-        if self.scan_line is not None:
-            return self.scan_line
-        ny, nx = self.layout_um.shape[-2:]
-        return torch.arange(ny, device=self.layout_um.device)[:, None].expand(ny, nx)
-
 
 Apply = Callable[[Tensor, Values, FieldContext], Tensor]
+
+
+def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The formula of an effect that has none: each scan has its own, which its scan terms fit."""
+    raise InputError("an effect in a model", got="one of single scans", wanted="one value for all scans")
 
 
 @dataclass(frozen=True)
@@ -166,14 +156,13 @@ class Effect:
         stage, role: where it happens; whether it may enter the exported process model.
         acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
         parameters: name to ``Parameter``; at least one amplitude.
-        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm.
+        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm;
+            ``of_single_scans`` for what scan terms fit.
         trials: parameter sets (those not named are off) at which screening takes the secant
-            direction; one per separate direction or length scale.
+            direction; by default one amplitude at a time, at each of its values to be tried, in each shape.
         source: where the formula comes from.
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
-        per_scan: its parameters belong to one scan and have no value shared by all.
-        along_lines: it depends on the line alone, so offsets of single lines would hide it.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
         knowledge: a cause has a name; a law only a formula; a description only a covariate.
@@ -189,9 +178,7 @@ class Effect:
     source: str
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
-    needs: tuple[Literal["order", "levels"], ...] = ()
-    per_scan: bool = False
-    along_lines: bool = False
+    needs: tuple[Literal["order"], ...] = ()
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
     knowledge: Knowledge = "cause"
@@ -202,6 +189,21 @@ class Effect:
         if not amplitudes:
             raise InputError(f"effect {self.name}", got="no amplitude", wanted="at least one")
         object.__setattr__(self, "amplitudes", amplitudes)
+        if not (self.trials or self.per_scan):
+            object.__setattr__(self, "trials", tuple(self._trials()))
+
+    @property
+    def per_scan(self) -> bool:
+        """Whether its parameters belong to one scan and have no value shared by all."""
+        return self.apply is of_single_scans
+
+    def _trials(self) -> Iterator[dict[str, float]]:
+        shapes = {n: p.tried for n, p in self.parameters.items() if n not in self.amplitudes and p.tried}
+        for shape in product(*shapes.values()):
+            for name in self.amplitudes:
+                facts = self.parameters[name]
+                for value in facts.tried or (facts.typical,):
+                    yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
         """Parameters at which the effect is the identity."""
@@ -250,8 +252,26 @@ class Effect:
         return torch.rot90(seen, -turn, (-2, -1))
 
 
-# The entries of most effects, by where they happen: called like ``Effect``, without these three fields.
-of_exposure = partial(Effect, stage="exposure", role="process", acts_on="layout")
-of_resist = partial(Effect, stage="resist", role="process", acts_on="height")
-of_development = partial(Effect, stage="development", role="process", acts_on="height")
-of_microscope = partial(Effect, stage="measurement", role="measurement", acts_on="height")
+def entry(
+    title: str,
+    parameters: Mapping[str, Parameter],
+    *,
+    stage: Stage,
+    role: Role,
+    acts_on: ActsOn,
+    **facts: Any,
+) -> Callable[[Apply], Effect]:
+    """Makes an effect of a formula, under the formula's name; ``facts``: the other fields of ``Effect``."""
+
+    def of_formula(apply: Apply) -> Effect:
+        name = apply.__name__.replace("_", "-")
+        return Effect(name, title, stage, role, acts_on, parameters, apply, **facts)
+
+    return of_formula
+
+
+# Where most effects happen; an entry that differs says so.
+of_exposure = partial(entry, stage="exposure", role="process", acts_on="layout")
+of_resist = partial(entry, stage="resist", role="process", acts_on="height")
+of_development = partial(entry, stage="development", role="process", acts_on="height")
+of_microscope = partial(entry, stage="measurement", role="measurement", acts_on="height")

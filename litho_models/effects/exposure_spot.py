@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
 # Below this difference of variances the spot is sharpened along one axis as much as it is widened
@@ -20,6 +20,15 @@ _SLICED_VARIANCE_UM2 = 0.02
 _SLICED_REACH_UM = 0.8
 
 
+@of_exposure(
+    "writing spot wider along one direction",
+    {
+        name: Parameter("µm²", -0.4, 0.4, 0.02, tried=(0.02, 0.1, -0.1))
+        for name in ("stretch_um2", "shear_um2")
+    },
+    source="Gaussian spot of the paper, with a full second-moment matrix",
+    separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+)
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """T = exp(-2 π² f' C f), C the change of the spot's second moments with (Cxx - Cyy, 2 Cxy) given."""
     stretch, shear = values["stretch_um2"], values["shear_um2"]
@@ -32,17 +41,28 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM)
 
 
+@of_exposure(
+    "dose leaking in from the neighbourhood",
+    {
+        "weight": Parameter("1", -0.3, 1.5, 0.1),
+        "length_um": Parameter("µm", 0.6, 10.0, 2.0, "shape", tried=(1.0, 2.0, 4.0, 8.0)),
+    },
+    source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
+    separating="print one feature alone and inside dense surroundings of three sizes",
+)
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """D = (M + η G_b * M) / (1 + η): the dose of the neighbourhood within b leaks in."""
     weight, length = values["weight"], values["length_um"]
-
-    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-        blur_minus_one = torch.expm1(-2 * math.pi**2 * length**2 * (fy * fy + fx * fx))
-        return weight / (1 + weight) * blur_minus_one
-
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, 3 * float(length.detach()))
+    blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
+    return layout + weight / (1 + weight) * (blurred - layout)
 
 
+@of_exposure(
+    "height not proportional to dose",
+    {"exponent": Parameter("1", 0.4, 2.0, 1.15, null=1.0)},
+    source="Schwarzschild exponent of the dose",
+    separating="a wide staircase of all levels and a power sweep",
+)
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """D = M_ref (M / M_ref)^p, with a foot of 1 % so that the slope at M = 0 stays finite."""
     foot = 0.01
@@ -52,6 +72,17 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     return layout + full * ((relative**exponent - bottom) / (top - bottom) - (relative - foot))
 
 
+@of_exposure(
+    "slices setting one by one",
+    {
+        "share": Parameter("1", 0.0, 1.0, 0.3),
+        "threshold": Parameter("1", 0.2, 0.8, 0.5, "shape", tried=(0.35, 0.5, 0.65)),
+        "steepness": Parameter("1", 4.0, 40.0, 12.0, "shape"),
+    },
+    acts_on="height",
+    source="slicing of the paper, 0.1 µm; threshold per slice",
+    separating="pillars and pits of one width and several heights, one slice and many",
+)
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """(1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M: slices of height t set one by one.
 
@@ -63,10 +94,8 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     # Another dose is another exposure of as many slices.
     number = layout / (context.dose * context.slice_um)
     slices = context.dose * torch.clamp(number - torch.arange(count).to(layout)[:, None, None], 0, 1)
-    variance = torch.as_tensor(_SLICED_VARIANCE_UM2, dtype=layout.dtype, device=layout.device)
-    exposed = add_blur(
-        slices.reshape(count, 1, *layout.shape[-2:]), variance, context.pitch_um, _SLICED_REACH_UM
-    )
+    slices = slices.reshape(count, 1, *layout.shape[-2:])
+    exposed = add_blur(slices, layout.new_tensor(_SLICED_VARIANCE_UM2), context.pitch_um, _SLICED_REACH_UM)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
     return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)
 
@@ -74,65 +103,3 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
 def _step(dose: Tensor, threshold: Tensor, steepness: Tensor) -> Tensor:
     low, high = (torch.sigmoid(steepness * (edge - threshold)) for edge in (0.0, 1.0))
     return (torch.sigmoid(steepness * (dose - threshold)) - low) / (high - low)
-
-
-EFFECTS = (
-    of_exposure(
-        name="elliptical-psf",
-        title="writing spot wider along one direction",
-        parameters={
-            "stretch_um2": Parameter("µm²", -0.4, 0.4, 0.02),
-            "shear_um2": Parameter("µm²", -0.4, 0.4, 0.02),
-        },
-        apply=elliptical_psf,
-        trials=(
-            {"stretch_um2": 0.02},
-            {"shear_um2": 0.02},
-            {"stretch_um2": 0.1},
-            {"shear_um2": 0.1},
-            {"stretch_um2": -0.1},
-            {"shear_um2": -0.1},
-        ),
-        source="Gaussian spot of the paper, with a full second-moment matrix",
-        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
-    ),
-    of_exposure(
-        name="long-range-proximity",
-        title="dose leaking in from the neighbourhood",
-        parameters={
-            "weight": Parameter("1", -0.3, 1.5, 0.1),
-            "length_um": Parameter("µm", 0.6, 10.0, 2.0, kind="shape"),
-        },
-        apply=long_range_proximity,
-        trials=tuple({"weight": 0.1, "length_um": length} for length in (1.0, 2.0, 4.0, 8.0)),
-        source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
-        separating="print one feature alone and inside dense surroundings of three sizes",
-    ),
-    of_exposure(
-        name="dose-exponent",
-        title="height not proportional to dose",
-        parameters={"exponent": Parameter("1", 0.4, 2.0, 1.15, null=1.0)},
-        apply=dose_exponent,
-        trials=({"exponent": 1.15},),
-        source="Schwarzschild exponent of the dose",
-        separating="a wide staircase of all levels and a power sweep",
-    ),
-    Effect(
-        name="layer-stacking",
-        title="slices setting one by one",
-        stage="exposure",
-        role="process",
-        acts_on="height",
-        parameters={
-            "share": Parameter("1", 0.0, 1.0, 0.3),
-            "threshold": Parameter("1", 0.2, 0.8, 0.5, kind="shape"),
-            "steepness": Parameter("1", 4.0, 40.0, 12.0, kind="shape"),
-        },
-        apply=layer_stacking,
-        trials=tuple(
-            {"share": 0.3, "threshold": threshold, "steepness": 12.0} for threshold in (0.35, 0.5, 0.65)
-        ),
-        source="slicing of the paper, 0.1 µm; threshold per slice",
-        separating="pillars and pits of one width and several heights, one slice and many",
-    ),
-)

@@ -10,6 +10,11 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
+from litho_models.effects.effect import FieldContext
+
+# Slope below which a power of it is rounded off.
+_LEAST_SLOPE = 1e-3
+
 
 def add_filtered(
     field: Tensor,
@@ -47,6 +52,12 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
     )
 
 
+def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
+    """Mean relative nominal height within that length of each pixel (1, 1, y, x)."""
+    relative = context.layout_um / context.full_height_um
+    return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
+
+
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
     """Transfer of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential tail of length l.
 
@@ -70,6 +81,11 @@ def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     return along_y, along_x
 
 
+def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
+    """A power of the size of a slope, zero without one, rounded off near zero so that it has a derivative."""
+    return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
+
+
 def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
     """Field looked up at (y + shift_y, x + shift_x), cubic; a zero shift gives the field bit for bit.
 
@@ -78,16 +94,10 @@ def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: fl
         shift_y_um, shift_x_um: maps (y, x) or numbers, µm.
     """
     ny, nx = field.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(ny, dtype=field.dtype, device=field.device),
-        torch.arange(nx, dtype=field.dtype, device=field.device),
-        indexing="ij",
-    )
-    return (
-        field
-        + _look_up(field, y + shift_y_um / pitch_um, x + shift_x_um / pitch_um)
-        - _look_up(field, y + 0 * shift_y_um, x + 0 * shift_x_um)
-    )
+    y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in (ny, nx))
+    rows, columns = y[:, None], x[None, :]
+    moved = _look_up(field, rows + shift_y_um / pitch_um, columns + shift_x_um / pitch_um)
+    return field + moved - _look_up(field, rows, columns)
 
 
 def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:

@@ -4,68 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
 
 from litho_data.foundation.errors import InputError, require_known
-from litho_models.effects import (
-    development,
-    exposure_field,
-    exposure_scanning,
-    exposure_spot,
-    measurement_height,
-    measurement_lateral,
-    measurement_tip,
-    resist,
-)
-from litho_models.effects.effect import Effect, Stage
+from litho_models.effects import exposure_spot, exposure_writing, measurement, resist, single_scans
+from litho_models.effects.effect import Effect
 from litho_models.effects.laws import LAWS, TABLES
-
-_FORWARD_ORDER = (
-    "layer-stacking",
-    "line-shortening",
-    "dose-exponent",
-    "elliptical-psf",
-    "galvo-lag",
-    "galvo-nonlinearity",
-    "vignetting",
-    "laser-drift",
-    "long-range-proximity",
-    "write-order-memory",
-    "threshold-softness",
-    "diffusion-blur",
-    "height-saturation",
-    "interface-offset",
-    "field-curvature",
-    "hatch-ripple",
-    "vertical-shrinkage",
-    "dose-dependent-shrinkage",
-    "lateral-shrinkage",
-    "feature-collapse",
-    "trench-residue",
-    "slope-thinning",
-    "line-roughness",
-    "tip-dilation",
-    "feedback-lag",
-    "registration-residual",
-    "piezo-nonlinearity",
-    "resampling-blur",
-    "z-gain",
-    "datum-offset",
-    "tilt-bow",
-    "scan-line-stripes",
-    "slow-drift",
-)
-
-_FAMILIES = (
-    exposure_spot,
-    exposure_scanning,
-    exposure_field,
-    resist,
-    development,
-    measurement_height,
-    measurement_lateral,
-    measurement_tip,
-)
 
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
 UNTESTABLE = {
@@ -74,17 +17,48 @@ UNTESTABLE = {
     "scars-and-spikes": "a mask, not a term: looked for among the outliers",
 }
 
-TIP = "tip-dilation"
+# Those of single scans act in no model.
+_FORWARD_ORDER = (
+    *single_scans.EFFECTS,
+    exposure_spot.layer_stacking,
+    exposure_writing.line_shortening,
+    exposure_spot.dose_exponent,
+    exposure_spot.elliptical_psf,
+    exposure_writing.galvo_lag,
+    exposure_writing.galvo_nonlinearity,
+    exposure_writing.vignetting,
+    exposure_writing.laser_drift,
+    exposure_spot.long_range_proximity,
+    exposure_writing.write_order_memory,
+    resist.threshold_softness,
+    resist.diffusion_blur,
+    resist.height_saturation,
+    exposure_writing.interface_offset,
+    exposure_writing.field_curvature,
+    exposure_writing.hatch_ripple,
+    resist.vertical_shrinkage,
+    resist.dose_dependent_shrinkage,
+    resist.lateral_shrinkage,
+    resist.feature_collapse,
+    resist.trench_residue,
+    resist.slope_thinning,
+    measurement.tip_dilation,
+    measurement.feedback_lag,
+    measurement.piezo_nonlinearity,
+    measurement.resampling_blur,
+)
 
-CATALOGUE: dict[str, Effect] = {}
+TIP = measurement.tip_dilation.name
+
+CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     """Add an effect to the catalogue; returns it. From then on it is a candidate of the loop.
 
     Args:
-        effect: the effect; one of single scans (``per_scan``) needs a scan term as well, see
-            ``litho_models.scan_terms.register_scan_term``.
+        effect: the effect; one of single scans (``apply`` is ``of_single_scans``) needs a scan term as well,
+            see ``litho_models.scan_terms.register_scan_term``.
         after: the effect behind which it acts; by default it is the last one of its stage.
 
     Raises:
@@ -120,12 +94,9 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
         InputError: a name that is no effect's.
     """
     given = {get_effect(name).name for name in names}
-    stages = list(get_args(Stage))
+    known = {**CATALOGUE, **LAWS, **TABLES}
     # What has no name acts on the finished print, before the microscope sees it.
-    print_ends = max(i for i, one in enumerate(CATALOGUE.values()) if one.stage != stages[-1])
-    known = list(CATALOGUE)
-    nameless = [name for name in (*LAWS, *TABLES) if name in given]
-    ordered = [*known[: print_ends + 1], *nameless, *known[print_ends + 1 :]]
+    ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
     return [name for name in ordered if name in given]
 
 
@@ -136,10 +107,10 @@ def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
         tip_radius_um: of the microscope's tip, or the most that it can be, if the store knows it: the tip is
             tried at that size too.
     """
-    effects = [effect for effect in CATALOGUE.values() if not effect.per_scan]
-    if tip_radius_um is None:
-        return effects
-    return [_tried_at(effect, tip_radius_um) if effect.name == TIP else effect for effect in effects]
+    effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
+    if tip_radius_um is not None:
+        effects[TIP] = _tried_at(effects[TIP], tip_radius_um)
+    return [*effects.values()]
 
 
 def _tried_at(tip: Effect, radius_um: float) -> Effect:
@@ -150,14 +121,3 @@ def _tried_at(tip: Effect, radius_um: float) -> Effect:
     if any(abs(radius_um - one) < 0.2 * one for one in known):
         return tip
     return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))
-
-
-def _fill() -> None:
-    """The built-in effects in the order in which they act; one without a place in it is last of its stage."""
-    found = {effect.name: effect for family in _FAMILIES for effect in family.EFFECTS}
-    CATALOGUE.update((name, found.pop(name)) for name in _FORWARD_ORDER)
-    for effect in found.values():
-        register_effect(effect)
-
-
-_fill()

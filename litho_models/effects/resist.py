@@ -1,21 +1,43 @@
-"""Resist: how dose becomes height before development."""
+"""Resist: how dose becomes height, and what shrinks, stays or is lost when it is developed."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from litho_models.effects.effect import FieldContext, Parameter, Values, of_resist
-from litho_models.effects.filters import add_blur
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_development, of_resist
+from litho_models.effects.filters import add_blur, add_warp, dose_nearby, gradient, rounded_power
 
 _BLUR_REACH_UM = 4.0
+_OF_NARROW = {
+    "fraction": Parameter("1", 0.0, 0.9, 0.1),
+    "width_um": Parameter("µm", 0.2, 3.0, 0.5, "shape", tried=(0.4, 0.8, 1.4)),
+}
 
 
+@of_resist(
+    "reactants diffusing sideways",
+    {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.01, tried=(0.01, 0.09))},
+    source="Lang 2022, arXiv:2205.14891; the paper's diffusion kernel",
+    separating="step edges of two heights, scanned with two pixel sizes and a new tip",
+)
 def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H blurred by an isotropic Gaussian of variance s²: reactants diffuse after the exposure."""
     return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
 
+@of_resist(
+    "exposure threshold of the resist",
+    {
+        "steepness_squared": Parameter("1", 0.0, 60.0, 2.0),
+        "centre": Parameter("1", 0.05, 0.95, 0.5, "shape", tried=(0.2, 0.5, 0.8)),
+    },
+    source="Zhou 2014, the normalised projection used in the paper's Physics model",
+    separating="a wide staircase of all levels",
+)
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Normalised tanh projection about η, identity for α² -> 0 and a step for α² -> inf.
 
@@ -34,40 +56,131 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     return height + full * (project(squared) - project(0 * squared))
 
 
+@of_resist(
+    "tall structures growing less than nominal",
+    {"rate_per_um": Parameter("1/µm", 0.0, 1.0, 0.1)},
+    source="first-order saturation of the printed height",
+    separating="a wide staircase of all levels",
+)
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H / (1 + q |H|): tall structures grow less than the dose says."""
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
-EFFECTS = (
-    of_resist(
-        name="diffusion-blur",
-        title="reactants diffusing sideways",
-        parameters={"variance_um2": Parameter("µm²", 0.0, 1.0, 0.01)},
-        apply=diffusion_blur,
-        trials=({"variance_um2": 0.01}, {"variance_um2": 0.09}),
-        source="Lang 2022, arXiv:2205.14891; the paper's diffusion kernel",
-        separating="step edges of two heights, scanned with two pixel sizes and a new tip",
-    ),
-    of_resist(
-        name="threshold-softness",
-        title="exposure threshold of the resist",
-        parameters={
-            "steepness_squared": Parameter("1", 0.0, 60.0, 2.0),
-            "centre": Parameter("1", 0.05, 0.95, 0.5, kind="shape"),
-        },
-        apply=threshold_softness,
-        trials=tuple({"steepness_squared": 2.0, "centre": centre} for centre in (0.2, 0.5, 0.8)),
-        source="Zhou 2014, the normalised projection used in the paper's Physics model",
-        separating="a wide staircase of all levels",
-    ),
-    of_resist(
-        name="height-saturation",
-        title="tall structures growing less than nominal",
-        parameters={"rate_per_um": Parameter("1/µm", 0.0, 1.0, 0.1)},
-        apply=height_saturation,
-        trials=({"rate_per_um": 0.1},),
-        source="first-order saturation of the printed height",
-        separating="a wide staircase of all levels",
-    ),
+@of_development(
+    "the whole print losing height on development",
+    {"fraction": Parameter("1", 0.0, 0.7, 0.05)},
+    source="Meisel 2006, cited in the paper",
+    separating="a step standard for the microscope, then a printed staircase",
 )
+def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """(1 - k) H: the whole print loses height."""
+    return (1 - values["fraction"]) * height
+
+
+@of_development(
+    "thin surroundings shrinking more than thick ones",
+    {
+        "fraction": Parameter("1", 0.0, 0.5, 0.1),
+        "length_um": Parameter("µm", 0.3, 6.0, 1.0, "shape", tried=(0.5, 1.5, 4.0)),
+    },
+    source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
+    separating="print the same height inside low and high surroundings; a power sweep",
+)
+def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H (1 - k (1 - u)), u the relative nominal height nearby: thin surroundings shrink more."""
+    return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
+
+
+@of_development(
+    "tops shrinking towards the centre of the field",
+    {"fraction": Parameter("1", 0.0, 0.1, 0.005)},
+    source="print bound to the substrate at its base, free at its top",
+    separating="print the layout in fields of two sizes",
+)
+def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H(r + s H(r) / full r), r from the centre of the field: tops pull in, more than bases.
+
+    What the mean height pulls is a magnification, which registration has taken out of a scan: what it shows
+    at x is what lies at r = x / (1 + s mean / full).
+    """
+    places = context.centred_um()
+    share = values["fraction"] / context.full_height_um
+    raw = 1 / (1 + share * height.mean())
+
+    def looked_up(scale: Tensor) -> Tensor:
+        shift_y, shift_x = ((scale - 1) * place for place in places)
+        return add_warp(height, shift_y, shift_x, context.pitch_um)
+
+    return looked_up(raw * (1 + share * looked_up(raw)[0, 0]))
+
+
+@of_development(
+    "narrow tall features losing height",
+    _OF_NARROW,
+    source="capillary force while drying; opening of the surface by a square of width w",
+    separating="pillars of one height and five widths, dried in air and supercritically",
+)
+def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H - φ (H - open_w(H)): what is narrower than w loses a share of its height above its surroundings."""
+    return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
+
+
+@of_development(
+    "resist left in narrow trenches",
+    _OF_NARROW,
+    source="closing of the surface by a square of width w",
+    separating="trenches of five widths, developed for two times",
+)
+def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + ρ (close_w(H) - H): resist stays in pits narrower than w; tops are unchanged."""
+    return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
+
+
+def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
+    """Closing by a square: whatever is narrower and lower than its surroundings is filled.
+
+    A square is an odd number of pixels wide; between two of them the closing is interpolated.
+    """
+    half_px = (width_um / context.pitch_um / 2).clamp(min=1)
+    below = math.floor(float(half_px.detach()))
+    closed = _closed_by(height, below)
+    return closed + (half_px - below) * (_closed_by(height, below + 1) - closed)
+
+
+def _closed_by(height: Tensor, half_px: int) -> Tensor:
+    """Closing by a square of 2 half_px + 1 pixels; the field goes on beyond its edge."""
+    padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
+    return -_largest(-_largest(padded, half_px), half_px)
+
+
+def _largest(field: Tensor, half_px: int) -> Tensor:
+    """The largest value in a square around each pixel that has all of it, one axis after the other."""
+    size = 2 * half_px + 1
+    return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
+
+
+@of_development(
+    "height missing on slopes",
+    {
+        "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
+        "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
+        "exponent": Parameter("1", 0.7, 3.0, 2.0, "shape"),
+    },
+    role="undetermined",
+    trials=tuple(
+        {**axes, "exponent": power}
+        for power in (1.0, 2.0)
+        for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
+    ),
+    source="empirical: loss along a power of the slope, one coefficient per axis",
+    separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
+)
+def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H - cx |dH/dx|^p - cy |dH/dy|^p: height missing on slopes, by axis.
+
+    p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
+    """
+    power = values["exponent"]
+    along_y, along_x = (rounded_power(slope**2, power) for slope in gradient(height, context.pitch_um))
+    return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y

@@ -104,7 +104,6 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         field_radius_um=write["field_um"] / 2 if "field_um" in write else None,
         slow_axis=write.get("slow_axis", "y"),
         order=order,
-        scan_line=torch.from_numpy(line),
         quarter_turns=scan.quarter_turns,
         backward=scan.direction == -1,
         new_tip=scan.tip not in (None, 1),
@@ -145,7 +144,6 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
         field_radius_um=scan.context.radius_um(),
         scan_shape=(ny, nx),
         origin_px=(rows.start, columns.start),
-        scan_line=torch.from_numpy(scan.line[cut]),
     )
     return replace(scan, quadrant=_thinned(part, context, usable, usable, scan.line[cut]))
 

@@ -21,9 +21,9 @@ _HOPELESS: Status = "no experiment separates"
 
 def of_rivals(
     rivalry: Rivalry,
+    tried: Mapping[str, float],
     planned: Sequence[PlannedPrint],
     random: Sequence[PlannedPrint],
-    tried: Mapping[str, float],
     prints: int,
 ) -> PlannedQuestion:
     """A question whose rivals are models: judged on the planned prints, and on as many random layouts."""

@@ -29,8 +29,7 @@ from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision
 from litho_models.loop.single_scans import SingleScans
 from litho_models.planning.noise import left_nm
 from litho_models.planning.power import PRINT_SHARE, Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question
-from litho_models.planning.rival_fits import fit_rivals
+from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals
 from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
@@ -106,9 +105,8 @@ class Judge:
         law = f_distribution(count - 1, total - count)
         expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
         told = f"F({count - 1}, {total - count}) = {ratio:.2f} of prints against repeats"
-        return _of_owner(
-            question, self.new, told, law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P
-        )
+        left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
+        return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
         """Variance of line offsets along the layout's rows and along the scan lines of turned scans."""
@@ -128,7 +126,7 @@ class Judge:
             f"offsets vary by {written:.1f} nm² along the layout's rows and by {scanned:.1f} nm² along the "
             f"lines of the turned scans (z = {z:.1f})"
         )
-        return _of_owner(question, turned, told, z >= Z_DECIDED, z <= -Z_DECIDED)
+        return _decision(question, turned, _left(z >= Z_DECIDED, z <= -Z_DECIDED), told)
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
@@ -210,11 +208,9 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
     return np.add.reduceat(np.add.reduceat(np.nan_to_num(gain), rows, axis=0), columns, axis=1)
 
 
-def _of_owner(
-    question: Question, scans: Sequence[PreparedScan], evidence: str, printer: bool, scanned: bool
-) -> Decision:
-    left = BOTH if printer == scanned else [PRINTER if printer else MICROSCOPE]
-    return _decision(question, scans, left, evidence)
+def _left(printer: bool, microscope: bool) -> Sequence[str]:
+    """Who is left, by whom the scans speak for."""
+    return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
 
 def _decision(

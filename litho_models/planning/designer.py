@@ -102,10 +102,8 @@ def climbed(
     """
     kept.mkdir(parents=True, exist_ok=True)
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
-    ranked = []
-    for rivalry in rivalries:
-        found = [one for one in starts(tile_px, limits, seed) if _repeats(one[1]) <= _MOST_REPEATING]
-        ranked.append(sorted(found, key=lambda one: -score(rivalry, one[1], chosen.ways)))
+    able = [one for one in starts(tile_px, limits, seed) if _repeats(one[1]) <= _MOST_REPEATING]
+    ranked = [sorted(able, key=lambda one: -score(rivalry, one[1], chosen.ways)) for rivalry in rivalries]
     tiles, names = [], []
     for number in range(count):
         rank, which = divmod(number, len(rivalries))

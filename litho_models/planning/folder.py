@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.cards.card import Use
 from litho_data.foundation.files import atomic_file
-from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_models.planning.designer import WORDS
 from litho_models.planning.layouts import Limits
@@ -32,6 +32,13 @@ _COLUMNS = (
     *("id", "order", "field_x_um", "field_y_um", "dose", "use"),
     *("turned_deg", "direction", "tip", "pixel_size"),
 )
+_REFERENCES = {
+    "substrate": "zero, tilt and bow without a print",
+    "flat": "the noise floor",
+    "steps": "height against level; the microscope's gain on a step standard",
+    "grating": "scales and unevenness of the scanner, and the tip",
+}
+# What the printer makes of them.
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -56,37 +63,35 @@ def schedule(
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
     unprinted = flat((size_px, size_px), level=0)
     middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
-    scans: list[PlannedScan] = []
-    levels: list[np.ndarray] = []
-
-    def add(use: Use, number: int, at: int, level: np.ndarray, one: PlannedPrint, way: Way, why: str) -> None:
-        reach_um = printing.reach_um(one)
-        levels.append(level)
-        scans.append(
-            PlannedScan(
-                id=f"N{number}F{at}",
-                print=str(number),
-                order=len(scans),
-                use=use,
-                **vars(way),
-                field_x_um=reach_um,
-                field_y_um=reach_um,
-                dose=one.dose,
-                why=why,
-            )
-        )
-
     plain = PlannedPrint(planned[0].level, ())
-    add("substrate", 0, 1, unprinted, plain, Way(), "zero, tilt and bow without a print")
-    add("flat", 0, 2, middle, plain, Way(), "the noise floor")
-    add("steps", 0, 3, ladder, plain, Way(), "height against level; the microscope's gain on a step standard")
-    add("grating", 0, 4, unprinted, plain, Way(), "scales and unevenness of the scanner, and the tip")
+    references: dict[Use, np.ndarray] = {
+        "substrate": unprinted, "flat": middle, "steps": ladder, "grating": unprinted,
+    }  # fmt: skip
+    rows = [
+        (use, 0, at, level, plain, Way(), _REFERENCES[use])
+        for at, (use, level) in enumerate(references.items(), start=1)
+    ]
     for number, one in enumerate(planned, start=1):
+        level = one.level.numpy().astype(np.uint8)
+        weaker = f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
         for at, way in enumerate(one.ways, start=1):
-            why = WORDS.get(way, "as the prints so far")
-            why += f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
-            add("dataset", number, at, one.level.numpy().astype(np.uint8), one, way, why)
-    return scans, levels
+            why = WORDS.get(way, "as the prints so far") + weaker
+            rows.append(("dataset", number, at, level, one, way, why))
+    scans = [
+        PlannedScan(
+            id=f"N{number}F{at}",
+            print=str(number),
+            order=order,
+            use=use,
+            **vars(way),
+            field_x_um=printing.reach_um(one),
+            field_y_um=printing.reach_um(one),
+            dose=one.dose,
+            why=why,
+        )
+        for order, (use, number, at, _, one, way, why) in enumerate(rows)
+    ]
+    return scans, [level for _, _, _, level, *_ in rows]
 
 
 def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
@@ -94,31 +99,32 @@ def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], pri
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
     write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
-    CardText(
+    write_card(
+        folder,
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide what is open on {plan.dataset.name}",
         pitch_um=printing.pitch_um,
         level_height_um=printing.level_height_um,
         levels=printing.highest + 1,
         scan_size_um=(plan.field_um, plan.field_um),
-        print_pattern=PRINT_PATTERN,
-        slow_axis="y",
-        write_field_um=printing.write_field_um,
-        plan_of=plan.dataset.sha256,
-        grating_um=_grating_um(plan),
-    ).write(folder)
+        ids={"print": PRINT_PATTERN, "table": TABLE_NAME},
+        write={"slow_axis": "y", "field_um": printing.write_field_um},
+        plan={"dataset_sha256": plan.dataset.sha256},
+        grating={"period_um": _grating_um(plan)},
+    )
     plan.write(folder)
-    for name, text in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
+    for name, lines in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
         with atomic_file(folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _grating_um(plan: NextPrint) -> float:
     return next((one for one in _PERIODS_UM if _FEWEST_PERIODS * one <= plan.field_um), _PERIODS_UM[-1])
 
 
-def _printer_sheet(plan: NextPrint) -> str:
-    lines = [
+def _printer_sheet(plan: NextPrint) -> list[str]:
+    printed = [scan for scan in plan.scans if scan.use in _USES or scan.id.endswith("F1")]
+    return [
         f"# Printing for {plan.dataset.name}",
         "",
         f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the resist and recipe of the "
@@ -126,23 +132,20 @@ def _printer_sheet(plan: NextPrint) -> str:
         "",
         "| order | layout | centre in the write field (x, y), µm | dose, of the recipe's | what it is |",
         "|---|---|---|---|---|",
-    ]
-    printed = [scan for scan in plan.scans if scan.use in _USES or scan.id.endswith("F1")]
-    for scan in printed:
-        what = "print" if scan.use == "dataset" else _USES[scan.use]
-        place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
-        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {scan.dose:g} | {what} |")
-    lines += [
+        *(
+            f"| {scan.order} | layouts/{scan.id}.tif | {scan.field_x_um:g}, {scan.field_y_um:g} | "
+            f"{scan.dose:g} | {_USES.get(scan.use, 'print')} |"
+            for scan in printed
+        ),
         "",
         "Dose is what the resist takes up: with two photons it goes with the square of the laser power, so "
         "that 0.8 of it takes 0.89 of the power.",
         "Note the laser power before each print, and anything that went otherwise than written here.",
     ]
-    return "\n".join(lines) + "\n"
 
 
-def _microscope_sheet(plan: NextPrint) -> str:
-    lines = [
+def _microscope_sheet(plan: NextPrint) -> list[str]:
+    return [
         f"# Scanning for {plan.dataset.name}",
         "",
         f"{len(plan.scans)} scans in this order. Save raw heights, not levelled, one file per scan: "
@@ -156,16 +159,12 @@ def _microscope_sheet(plan: NextPrint) -> str:
         "",
         "| order | scan | print | turned | direction | tip | pixels | why |",
         "|---|---|---|---|---|---|---|---|",
-    ]
-    for scan in plan.scans:
-        direction = "there" if scan.direction > 0 else "back"
-        tip = "as before" if scan.tip == 1 else "new"
-        pixels = "as before" if scan.pixel_size == 1 else f"{scan.pixel_size:g} of their size"
-        lines.append(
-            f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | {direction} | {tip} | "
-            f"{pixels} | {scan.why} |"
-        )
-    lines += [
+        *(
+            f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | "
+            f"{'there' if scan.direction > 0 else 'back'} | {'as before' if scan.tip == 1 else 'new'} | "
+            f"{'as before' if scan.pixel_size == 1 else f'{scan.pixel_size:g} of their size'} | {scan.why} |"
+            for scan in plan.scans
+        ),
         "",
         "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`, "
         "`pixel_size`): a turned scan without its column is refused. Then",
@@ -173,4 +172,3 @@ def _microscope_sheet(plan: NextPrint) -> str:
         "    litho-data build card.toml --out next.zarr",
         "    litho-models close-loop prints.zarr next.zarr --out decided",
     ]
-    return "\n".join(lines) + "\n"

@@ -45,18 +45,16 @@ class Limits:
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
         """Levels with a share of a thousandth, and structure no finer than in the prints so far."""
         share = np.array(open_.level_share)
-        known, levels = np.flatnonzero(share >= _RARE), np.arange(len(share))
+        levels = np.arange(len(share))
+        known = levels[share >= _RARE].tolist()
         mean = float(share @ levels)
         sd = float(np.sqrt(share @ (levels - mean) ** 2))
-        return cls(int(known[0]), int(known[-1]), open_.cutoff_per_um, pitch_um, mean, sd)
+        return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
         """Printable soft levels (y, x) nearest to free ones."""
-        frequencies = [torch.fft.fftfreq(n, self.pitch_um).abs() for n in free.shape]
-        passed = (frequencies[0][:, None] <= self.cutoff_per_um) & (
-            frequencies[1][None, :] <= self.cutoff_per_um
-        )
-        smooth = torch.fft.ifft2(torch.fft.fft2(free) * passed).real
+        y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
+        smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
@@ -90,14 +88,14 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     """
     for number, finest in enumerate((1.0, 0.5, 0.8)):
         yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
-    high, low = limits.highest, limits.lowest
+    levels = {"high": limits.highest, "low": limits.lowest}
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
     patterns = {
-        "checkerboard": checkerboard(shape, cell_px=2 * feature, high=high, low=low),
-        "lines": line_space_sweep(shape, high=high, low=low, narrowest_px=feature),
-        "lines-along-x": line_space_sweep(shape, high=high, low=low, narrowest_px=feature, along="x"),
+        "checkerboard": checkerboard(shape, cell_px=2 * feature, **levels),
+        "lines": line_space_sweep(shape, narrowest_px=feature, **levels),
+        "lines-along-x": line_space_sweep(shape, narrowest_px=feature, along="x", **levels),
     }
     for name, pattern in patterns.items():
         whole = limits.random(size_px, seed + 7)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.results import Record
@@ -56,16 +57,16 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
     """Spectrum of maps of ``left_nm``, from tiles that are measured everywhere."""
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
-    window = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
+    window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
     window /= np.sqrt((window**2).mean())
-    powers = []
+    powers: list[np.ndarray] = []
     for residual in residuals_nm:
-        ny, nx = residual.shape
-        for top in range(0, ny - size + 1, size // 2):
-            for left in range(0, nx - size + 1, size // 2):
-                tile = residual[top : top + size, left : left + size]
-                if np.isfinite(tile).all():
-                    powers.append(np.abs(np.fft.fft2((tile - tile.mean()) * window)) ** 2 / size**2)
+        every = sliding_window_view(residual, (size, size))[:: size // 2, :: size // 2].reshape(
+            -1, size, size
+        )
+        tiles = every[np.isfinite(every).all(axis=(1, 2))]
+        about_mean = tiles - tiles.mean(axis=(1, 2), keepdims=True)
+        powers += [*np.abs(np.fft.fft2(about_mean * window)) ** 2 / size**2]
     if not powers:
         powers = [np.full((size, size), float(np.mean([np.nanvar(one) for one in residuals_nm])))]
     return NoiseSpectrum(power_nm2=np.round(np.mean(powers, axis=0), 3).tolist())

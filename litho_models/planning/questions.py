@@ -1,7 +1,13 @@
-"""``open_questions.json``: what a closed loop leaves open, as an experiment can be planned from it."""
+"""``open_questions.json``: what a closed loop leaves open, as an experiment can be planned from it.
+
+Rivals are fitted to the same prints so that none loses for where its fit began: the base's numbers have more
+than one optimum. A fit with an almost straight projection ends elsewhere than one with a steep one. Two
+effects that do the same, one fitted from each, then differ by several nm² on new layouts.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal
 
@@ -10,7 +16,10 @@ from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
 from litho_data.store.schema import DatasetId
+from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
+from litho_models.loop.fits import RULES, TwinProblem
 from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.planning.noise import NoiseSpectrum
 from litho_models.scan_terms.groups import ALL
@@ -41,20 +50,15 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """The model; ``bare``: its base alone."""
+        """The model, in which an effect goes with the print or with the scan; ``bare``: its base alone."""
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
-        return framed(bare.at(np.array(self.vector)), self.effect, self.owner)
-
-
-def framed(twin: Twin, effect: str, owner: Owner | None) -> Twin:
-    """A model in which an effect goes with the print, or with the scan."""
-    own = frozenset([effect])
-    return replace(
-        twin,
-        scan_frame=own if owner == "microscope" else frozenset(),
-        print_frame=own if owner == "printer" else frozenset(),
-    )
+        own = frozenset([self.effect])
+        return replace(
+            bare.at(np.array(self.vector)),
+            scan_frame=own if self.owner == "microscope" else frozenset(),
+            print_frame=own if self.owner == "printer" else frozenset(),
+        )
 
 
 class Question(Record):
@@ -93,3 +97,23 @@ class OpenQuestions(Result):
     cutoff_per_um: float
     write_field_um: float | None
     questions: list[Question]
+
+
+def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
+    """Each twin fitted from where it stands, and from the base's numbers of the best one."""
+
+    def fitted(twin: Twin) -> LeastSquaresFit:
+        return fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)
+
+    def squares(fit: LeastSquaresFit) -> float:
+        return eliminated_sum(fit.linear, RULES.term_weight)[2]
+
+    fits = [fitted(twin) for twin in twins]
+    best = min(fits, key=squares)
+    base = best.vector[: twins[0].own]
+    return [
+        fit
+        if fit is best or not len(base)
+        else min(fit, fitted(twin.at(np.concatenate([base, fit.vector[len(base) :]]))), key=squares)
+        for twin, fit in zip(twins, fits, strict=True)
+    ]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -89,12 +90,12 @@ class Printing:
         """What effects know of a planned scan."""
         reach_um = self.reach_um(printed)
         return FieldContext(
-            layout_um=layout_um,
-            pitch_um=self.pitch_um,
-            full_height_um=self.full_height_um,
-            slice_um=self.level_height_um,
-            field_centre_um=(reach_um, reach_um),
-            field_radius_um=None if self.write_field_um is None else self.write_field_um / 2,
+            layout_um,
+            self.pitch_um,
+            self.full_height_um,
+            self.level_height_um,
+            (reach_um, reach_um),
+            None if self.write_field_um is None else self.write_field_um / 2,
             order=printed.order,
             quarter_turns=way.turned_deg // 90,
             backward=way.direction < 0,
@@ -159,8 +160,7 @@ class Rivalry:
     @property
     def pairs(self) -> list[tuple[int, int]]:
         """Directed pairs: (the true one, the one refitted to it)."""
-        every = range(len(self.twins))
-        return [(a, b) for a in every for b in every if a != b]
+        return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
         """The same rivals, each as true with numbers that the prints so far allow as well."""
@@ -192,10 +192,11 @@ class Rivalry:
             start = twin = self.twins[other]
             prior = np.array(self.question.rivals[other].information)
             for number in range(rounds):
-                pairs = zip(
-                    self._linearise(twin, prints) if number else first[other], predicted[true], strict=True
-                )
-                linear = [replace(part, residual=part.residual + _flat(wanted)) for part, wanted in pairs]
+                here = self._linearise(twin, prints) if number else first[other]
+                linear = [
+                    replace(part, residual=part.residual + _flat(wanted))
+                    for part, wanted in zip(here, predicted[true], strict=True)
+                ]
                 normal, right, _ = eliminated_sum(linear, RULES.term_weight)
                 right = right - prior @ (twin.vector - start.vector)
                 twin = twin.at(twin.vector + solve_damped(normal + prior, right, _DAMPING, twin.room()))
@@ -216,8 +217,7 @@ class Rivalry:
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
         """Distance of each directed pair (pairs,), in standard deviations; differentiable in the levels."""
-        contrasts = self.contrasts(prints, refitted)
-        return torch.stack([one.separation(self.question.spread) for one in contrasts])
+        return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]

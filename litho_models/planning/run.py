@@ -42,7 +42,6 @@ def next_print(
     seed: int = 0,
     steps: int = STEPS,
     layouts: Literal["optimised", "random"] = "optimised",
-    cache: str | Path | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
     """Plan the prints and scans that decide what a closed loop left open; None if nothing is open.
@@ -53,7 +52,6 @@ def next_print(
         prints: how many at most; ``field_um``: side of each.
         seed: of random layouts; ``steps``: of the ascent of each tile.
         layouts: ``random`` for a control: the same scans of layouts that nothing was optimised in.
-        cache: folder where finished tiles are kept until the plan is there; beside ``out`` by default.
         report: told what happens, a sentence at a time.
 
     Raises:
@@ -84,19 +82,19 @@ def next_print(
     base = load_simulator(folder / MODEL_FOLDER, card)
     limits = Limits.of(open_, card.pitch_um)
     printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
-    contested = [q for q in open_.questions if q.rivals]
-    rivalries = [Rivalry(question, base, printing, open_.noise) for question in contested]
+    rivalries = [Rivalry(one, base, printing, open_.noise) for one in open_.questions if one.rivals]
     tile_px = min(TILE_PX, size_px)
     can_move = open_.write_field_um is not None and open_.write_field_um > field_um
     choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
     # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
-    turned = (TURNED,) if any(q.kind in ("lines", "per-scan") for q in open_.questions) else ()
+    turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
     chosen = together(choices, turned)
     count = _TILES if size_px > tile_px else prints
     tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
-    kept_in = Path(cache or f"{out}-cache")
+    # Finished tiles of an interrupted run.
+    cache = Path(f"{out}-cache")
     if rivalries and layouts == "optimised":
-        kept = kept_in / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
+        kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
         tiles, starts = climbed(
             rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
         )
@@ -112,16 +110,15 @@ def next_print(
     ]
     report("comparing the rivals on the planned prints, and on random ones")
     judged = planned[:_JUDGED]
-    random = [
-        replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i))) for i, one in enumerate(judged)
-    ]
+    levels = [as_tensor(limits.random(size_px, seed + 101 + i)) for i in range(len(judged))]
+    random = [replace(one, level=level) for one, level in zip(judged, levels, strict=True)]
     answered = {
-        rivalry.question.name: of_rivals(rivalry, judged, random, choice.tried, prints)
+        rivalry.question.name: of_rivals(rivalry, choice.tried, judged, random, prints)
         for rivalry, choice in zip(rivalries, choices, strict=True)
     }
-    scans_each = len(chosen.ways)
     questions = [
-        answered.get(q.name) or of_others(q, open_, prints, scans_each, size_px) for q in open_.questions
+        answered.get(one.name) or of_others(one, open_, prints, len(chosen.ways), size_px)
+        for one in open_.questions
     ]
     needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
     # One print alone may have a defect.
@@ -146,5 +143,5 @@ def next_print(
     with atomic_folder(out) as target:
         write_plan(target, plan, maps, printing)
         write_report(target, plan, rivalries, planned)
-    shutil.rmtree(kept_in, ignore_errors=True)
+    shutil.rmtree(cache, ignore_errors=True)
     return plan

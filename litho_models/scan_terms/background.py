@@ -42,7 +42,7 @@ class Background(Record):
 
     def fits(self, scan: PrintedScan) -> bool:
         """Whether the scan's field has the size that this was learned on; a bow is not that of another."""
-        return bool(np.allclose(field_um(scan), self.field_um, rtol=_SAME_SIZE, atol=0))
+        return is_of_size(scan, self.field_um)
 
     def map_um(self, shape: tuple[int, int]) -> FloatMap:
         """The background on a field of ``shape`` (ny, nx), µm."""
@@ -53,6 +53,11 @@ class Background(Record):
 def field_um(scan: PrintedScan) -> tuple[float, float]:
     """Size (y, x) of a scan's field, µm."""
     return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um
+
+
+def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
+    """Whether a scan's field has this size (y, x), µm."""
+    return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
 
 
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:

@@ -30,23 +30,13 @@ class Blocks(NamedTuple):
         buffer_px: pixels to fit on are farther than this from every pixel scored. One residual correlation
             length of the measured prints: about 0.5 at 5 px.
         line_gap_px: the same for offsets of lines, along the line.
-        border_px: pixels along the edge of a scan that are neither fitted on nor scored.
         seed: moves the origin of the checkerboard.
     """
 
     block_px: int = 32
     buffer_px: int = 7
     line_gap_px: int = 32
-    border_px: int = 0
     seed: int = 0
-
-    def inside(self, usable: BoolMap) -> BoolMap:
-        """The usable pixels without those of the border."""
-        if not self.border_px:
-            return usable
-        inner = np.zeros_like(usable)
-        inner[self.border_px : -self.border_px, self.border_px : -self.border_px] = True
-        return usable & inner
 
 
 class Half(NamedTuple):
@@ -90,19 +80,13 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
         axes: axes that lines run along, 1 for lines along x.
         gap_px: pixels along a line between a scored pixel and those its offset comes from, at least.
     """
-    sides: dict[int, list[tuple[BoolMap, BoolMap]]] = {}
-    for axis in sorted(set(axes)):
-        length = shape[axis]
-        at, middle = np.arange(length), length // 2
-        first, second = at < middle, at >= middle
-        beyond, before = at >= middle + gap_px, at < middle - gap_px
-        spread = [
-            (np.broadcast_to(np.expand_dims(part, 1 - axis), shape) for part in pair)
-            for pair in ((first, beyond), (second, before))
-        ]
-        sides[axis] = [(own, other) for own, other in spread]
-    cells = []
-    for choice in product(*sides.values()):
-        score = np.logical_and.reduce([own for own, _ in choice])
-        cells.append(Cell(score, dict(zip(sides, (other for _, other in choice), strict=True))))
+    axes, cells = sorted(set(axes)), []
+    for sides in product((False, True), repeat=len(axes)):
+        score, other_side = np.ones(shape, bool), {}
+        for axis, second in zip(axes, sides, strict=True):
+            at, middle = np.expand_dims(np.arange(shape[axis]), 1 - axis), shape[axis] // 2
+            score &= (at >= middle) == second
+            beyond = at < middle - gap_px if second else at >= middle + gap_px
+            other_side[axis] = np.broadcast_to(beyond, shape)
+        cells.append(Cell(score, other_side))
     return cells

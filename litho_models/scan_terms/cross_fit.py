@@ -16,11 +16,9 @@ from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import (
     FloatMap,
     LineIndex,
-    ScanTerm,
     TermPixels,
     Terms,
     chosen_terms,
-    line_terms,
     term_maps,
 )
 
@@ -72,17 +70,14 @@ def cross_fit(
     if scan_line is not None and (scan_line.shape != height.shape or scan_line.min() < 0):
         wanted = f"indices from 0, shape {height.shape}"
         raise InputError("scan_line", got=f"shape {scan_line.shape}", wanted=wanted)
-    usable = blocks.inside(np.asarray(valid, bool) & np.isfinite(height))
+    usable = np.asarray(valid, bool) & np.isfinite(height)
     bad = int(np.sum(~np.isfinite(prediction[usable])))
     if bad:
         raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="none")
     difference = np.where(usable, height - prediction, 0.0)
     residual = np.full(height.shape, np.nan)
-    if not terms:
-        residual[usable] = difference[usable]
-        return CrossFit(residual, 0.0, 0.0)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
-    lines = [_lines(term, height.shape, scan_line) for term in line_terms(terms)]
+    lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines is not None]
     axes = [axis_along(line) for line in lines]
     cells = line_cells(height.shape, axes, blocks.line_gap_px)
     freedom, variances = [], []
@@ -126,7 +121,7 @@ def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, te
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Coefficients (k,) of ``design`` (k, n) that come closest to ``target`` (n,); smallest if not unique."""
+    """Coefficients (k, …) of ``design`` (k, n) that come closest to ``target`` (n, …)."""
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 
 
@@ -142,8 +137,3 @@ def _fitted(basis: FloatMap, difference: FloatMap, calibrate: BoolMap) -> FloatM
             hint="use a larger field, a smaller block_px, or policy 'none'",
         )
     return np.tensordot(least_squares(design, difference[calibrate]), basis, axes=1)
-
-
-def _lines(term: ScanTerm, shape: tuple[int, ...], scan_line: LineIndex | None) -> LineIndex:
-    assert term.lines is not None
-    return term.lines(shape, scan_line)

@@ -51,12 +51,7 @@ class Products:
         """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
-        return [
-            dict(zip(slot, solved[start:end].reshape(len(slot), -1), strict=True))
-            for slot, start, end in zip(
-                expanded.slots, expanded.starts[:-1], expanded.starts[1:], strict=True
-            )
-        ]
+        return [{label: solved[rows] for label, rows in own.items()} for own in expanded.rows]
 
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
@@ -97,56 +92,55 @@ class Products:
         rest = [c for c in range(self.grams.shape[1]) if c not in used]
         solved = expanded.solve(rest)
         freed = np.empty_like(self.grams)
-        for members, rows, columns in expanded.alike:
+        for members, rows in expanded.alike:
             change = np.zeros(self.grams.shape[1:])
             change[rest, rest] = 1.0
             # Columns that several blocks share count for each of them.
-            np.subtract.at(change, (columns[:, None], np.array(rest)[None, :]), solved[rows])
+            np.subtract.at(change, np.ix_(expanded.columns, rest), solved[rows])
             freed[members] = change.T @ self.grams[members] @ change
         return Products(freed, self.groups)
 
 
 class _Expanded:
-    """Normal equations with one row for each strength of each label."""
+    """Normal equations with one row for each strength of each label.
+
+    Attributes:
+        columns: of all blocks; ``rows``: of each block, by label, those of its strengths.
+        alike: scans that are in the same groups, and the rows of their strengths, as ``columns``.
+    """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
-        self._products = products
-        labels = [products.groups[block.by] for block in blocks]
-        self.slots = [sorted({own[scan] for scan in scans}) for own in labels]
-        sizes = [len(slot) * len(block.columns) for slot, block in zip(self.slots, blocks, strict=True)]
-        self.starts = np.cumsum([0, *sizes])
-        self._columns = np.array([c for block in blocks for c in block.columns], np.intp)
+        self._grams = products.grams
+        self.columns = np.array([c for block in blocks for c in block.columns], np.intp)
         by: dict[tuple[str, ...], list[int]] = {}
         for scan in scans:
-            by.setdefault(tuple(own[scan] for own in labels), []).append(int(scan))
-        # Scans that are in the same groups, the rows of their strengths, and their columns.
+            by.setdefault(tuple(products.groups[block.by][scan] for block in blocks), []).append(int(scan))
+        usual = np.einsum("sii->i", self._grams[scans]) / max(len(scans), 1)
+        self.rows: list[dict[str, np.ndarray]] = []
+        shrunk: list[float] = []
+        for number, block in enumerate(blocks):
+            own = {}
+            for label in sorted({labels[number] for labels in by}):
+                own[label] = len(shrunk) + np.arange(len(block.columns))
+                shrunk += (block.shrinking * usual[list(block.columns)]).tolist()
+            self.rows.append(own)
         self.alike = [
-            (np.array(members), self._rows(blocks, own), self._columns) for own, members in by.items()
+            (
+                members,
+                np.array([row for own, one in zip(self.rows, labels, strict=True) for row in own[one]], int),
+            )
+            for labels, members in by.items()
         ]
-        usual = np.einsum("sii->i", products.grams[scans]) / max(len(scans), 1)
-        self._shrunk = np.concatenate(
-            [
-                np.tile(block.shrinking * usual[list(block.columns)], len(slot))
-                for block, slot in zip(blocks, self.slots, strict=True)
-            ]
-            or [np.empty(0)]
-        )
-
-    def _rows(self, blocks: Sequence[Block], labels: Sequence[str]) -> np.ndarray:
-        rows = [
-            start + slot.index(label) * len(block.columns) + np.arange(len(block.columns))
-            for block, slot, start, label in zip(blocks, self.slots, self.starts[:-1], labels, strict=True)
-        ]
-        return np.concatenate(rows) if rows else np.empty(0, np.intp)
+        self._shrunk = np.array(shrunk)
 
     def solve(self, targets: Sequence[int]) -> np.ndarray:
         """Strengths (rows, targets) that come closest to these columns, or to the residual."""
-        size, wanted = int(self.starts[-1]), np.array(targets, np.intp)
+        size = len(self._shrunk)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
-        for members, rows, columns in self.alike:
-            gram = self._products.grams[members].sum(axis=0)
-            matrix[np.ix_(rows, rows)] += gram[np.ix_(columns, columns)]
-            right[rows] += gram[np.ix_(columns, wanted)]
+        for members, rows in self.alike:
+            gram = self._grams[members].sum(axis=0)
+            matrix[np.ix_(rows, rows)] += gram[np.ix_(self.columns, self.columns)]
+            right[rows] += gram[np.ix_(self.columns, targets)]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
         normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
         return np.linalg.solve(normal, right / scale) / scale

@@ -9,7 +9,7 @@ printer: no design sees it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
@@ -22,6 +22,8 @@ from scipy.ndimage import map_coordinates
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
+from litho_models.scan_terms.background import field_um, is_of_size
+from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL, groupings, label_of
 from litho_models.scan_terms.term import FloatMap
@@ -58,7 +60,6 @@ _SAMPLED_PX = 16384
 # Displacements are found by their derivative; the second time around it is taken at the displaced print.
 _ROUNDS = 2
 _INNER_FOLDS = 5
-_SAME_SIZE = 0.01
 
 
 # What may be shared: its degree, its columns by group. A scan with its predicted print (ny, nx), µm.
@@ -87,6 +88,15 @@ class SharedPart(Record):
         """Fitted numbers."""
         return sum(len(own) for own in self.coefficients.values())
 
+    def of(self, scan: PrintedScan) -> list[float]:
+        """The coefficients of the scan's group; empty where it has none."""
+        return self.coefficients.get(label_of(scan, self.by), [])
+
+    def map_um(self, scan: PrintedScan) -> FloatMap:
+        """The polynomials on the scan's field, (ny, nx) µm; a background has none of degree 0."""
+        own = self.of(scan)
+        return np.tensordot(own, _polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
+
 
 class MeasurementModel(Record):
     """What scans share beside their prints.
@@ -111,21 +121,19 @@ class MeasurementModel(Record):
 
     def fits(self, scan: PrintedScan) -> bool:
         """Whether the scan's field has the size that this was learned on."""
-        return bool(np.allclose(_field_um(scan), self.field_um, rtol=_SAME_SIZE, atol=0))
+        return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
         """The map (ny, nx) that the microscope should show of a predicted print (ny, nx), µm.
 
         A field of another size has its levelling only.
         """
-        parts = self.parts if self.fits(scan) else []
+        parts = self._parts(scan)
         seen = _displaced(scan, prediction_um, parts)
         for part in parts:
-            own = part.coefficients.get(label_of(scan, part.by))
-            if own and part.what == "gain":
-                seen = seen + own[0] * (seen - seen.mean())
-        seen = _levelled(seen, scan.usable, self.levelling)
-        return seen + self.background_um(scan)
+            if part.what == "gain":
+                seen = seen + part.of(scan)[0] * (seen - seen.mean())
+        return _levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
         """The scan without what this adds to its predicted print (ny, nx), µm."""
@@ -148,12 +156,12 @@ class MeasurementModel(Record):
 
     def background_um(self, scan: PrintedScan) -> FloatMap:
         """The background alone on the scan's field, (ny, nx) µm."""
-        total = np.zeros(scan.shape)
-        for part in self.parts if self.fits(scan) else []:
-            own = part.coefficients.get(label_of(scan, part.by))
-            if own and part.what == "background":
-                total += np.tensordot(own, _polynomials(scan.shape, part.degree)[1:], axes=1)
-        return total
+        backgrounds = (part for part in self._parts(scan) if part.what == "background")
+        return sum((part.map_um(scan) for part in backgrounds), np.zeros(scan.shape))
+
+    def _parts(self, scan: PrintedScan) -> list[SharedPart]:
+        """Those that say something of the scan."""
+        return [part for part in self.parts if part.of(scan)] if self.fits(scan) else []
 
 
 def learn_measurement(
@@ -165,77 +173,71 @@ def learn_measurement(
     into folds among these scans, and only if they do so beyond the scatter over scans. Where fields differ in
     size, those of the most frequent one are learned from.
     """
-    field_um = Counter(map(_field_um, scans)).most_common(1)[0][0]
-    model = MeasurementModel(levelling="none", parts=[], field_um=field_um, scans=0)
+    usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
+    model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
     model = model.model_copy(update={"levelling": _best_levelling(pairs, model), "scans": len(pairs)})
     chosen: list[_Offer] = []
     for _ in range(_ROUNDS):
-        learner = _Learner(pairs, model)
-        chosen = chosen or learner.choose(seed)
-        model = model.model_copy(update={"parts": learner.fitted(chosen)})
+        products = _products(pairs, model)
+        chosen = chosen or _chosen(products, _deal([scan.id for scan, _ in pairs], seed))
+        model = model.model_copy(update={"parts": _fitted(products, chosen)})
         if not chosen:
             break
     return model
 
 
-class _Learner:
+def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
     """Inner products of what could be shared, at a model of the measurement so far."""
+    grams = []
+    for scan, prediction in pairs:
+        rows = _rows(scan, prediction, model)
+        grams.append(rows @ rows.T / rows.shape[1])
+    return Products(np.stack(grams), groupings([scan for scan, _ in pairs], by_order=False))
 
-    def __init__(self, pairs: Sequence[_Pair], model: MeasurementModel):
-        scans = [scan for scan, _ in pairs]
-        self._groups = groupings(scans, by_order=False)
-        self._ids = [scan.id for scan in scans]
-        grams = []
-        for scan, prediction in pairs:
-            rows = _rows(scan, prediction, model)
-            grams.append(rows @ rows.T / rows.shape[1])
-        self._products = Products(np.stack(grams), self._groups)
 
-    def choose(self, seed: int) -> list[_Offer]:
-        """What to add, beginning with nothing."""
-        if len(self._ids) < 2:
-            return []
-        fold_of = _deal(self._ids, seed)
-        chosen: list[_Offer] = []
-        left = self._products.held_out([], fold_of)
-        while True:
-            best, best_left = None, left
-            for offer in self._offers(chosen):
-                now = self._products.held_out([block for *_, block in (*chosen, offer)], fold_of)
-                if now.mean() < best_left.mean():
-                    best, best_left = offer, now
-            gain = left - best_left
-            error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-            if best is None or gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
-                return chosen
-            chosen.append(best)
-            left = best_left
+def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
+    """What to add, beginning with nothing; ``fold_of``: (scans,)."""
+    chosen: list[_Offer] = []
+    if len(fold_of) < 2:
+        return chosen
+    left = products.held_out([], fold_of)
+    while offers := _offers(products.groups, chosen):
+        tried = [products.held_out([block for *_, block in (*chosen, one)], fold_of) for one in offers]
+        best = int(np.argmin([one.mean() for one in tried]))
+        gain = left - tried[best]
+        error = gain.std(ddof=1) / np.sqrt(len(gain))
+        if gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
+            break
+        chosen.append(offers[best])
+        left = tried[best]
+    return chosen
 
-    def fitted(self, chosen: Sequence[_Offer]) -> list[SharedPart]:
-        """The parts with their strengths."""
-        every = np.arange(len(self._ids))
-        fitted = self._products.strengths([block for *_, block in chosen], every)
-        return [
-            SharedPart(
-                what=what,
-                by=block.by,
-                degree=degree,
-                shrinking=block.shrinking,
-                coefficients={label: own.tolist() for label, own in strengths.items()},
-            )
-            for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
-        ]
 
-    def _offers(self, chosen: Sequence[_Offer]) -> list[_Offer]:
-        taken = {(what, block.by) for what, _, block in chosen}
-        found = []
-        for what, degree, grouped in _OFFERS:
-            for by in [name for name in self._groups if (name != ALL) == grouped]:
-                if (what, by) not in taken:
-                    shrinking = _SHRINKING if grouped else _SHRINKING[:1]
-                    found += [(what, degree, Block(_columns_of(what, degree), by, one)) for one in shrinking]
-        return found
+def _offers(groups: Iterable[str], chosen: Sequence[_Offer]) -> list[_Offer]:
+    taken = {(what, block.by) for what, _, block in chosen}
+    return [
+        (what, degree, Block(_columns_of(what, degree), by, shrinking))
+        for what, degree, grouped in _OFFERS
+        for by in groups
+        if (by != ALL) == grouped and (what, by) not in taken
+        for shrinking in (_SHRINKING if grouped else _SHRINKING[:1])
+    ]
+
+
+def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
+    """The parts with their strengths."""
+    fitted = products.strengths([block for *_, block in chosen], np.arange(len(products.grams)))
+    return [
+        SharedPart(
+            what=what,
+            by=block.by,
+            degree=degree,
+            shrinking=block.shrinking,
+            coefficients={label: own.tolist() for label, own in strengths.items()},
+        )
+        for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
+    ]
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
@@ -245,7 +247,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     a whole, so that they are shrunk once, however often.
     """
     at = _thinned(scan.usable)
-    seen = _displaced(scan, prediction_um, model.parts)
+    seen = _displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
     slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
     shapes = _polynomials(scan.shape, _HIGHEST).reshape(_count(_HIGHEST), -1)[:, at]
     residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
@@ -253,52 +255,54 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
     # A background is added after the levelling, so that it is not levelled itself.
     surface = shapes[[0, *LEVELLED[model.levelling]]]
-    moved -= np.linalg.solve(surface @ surface.T, surface @ moved.T).T @ surface
+    moved -= least_squares(surface, moved.T).T @ surface
     rows = np.concatenate([residual[None], shapes[1:], moved])
     for part in model.parts:
-        known = part.coefficients.get(label_of(scan, part.by))
-        if known:
+        if known := part.of(scan):
             rows[0] += known @ rows[list(_columns_of(part.what, part.degree))]
     return rows - rows.mean(axis=1, keepdims=True)
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
     """Where the columns of a part lie among the rows of a scan."""
-    starts = {"background": 1, "shift-x": _count(_HIGHEST)}
-    starts["shift-y"] = starts["shift-x"] + _count(_LATERAL)
-    starts["gain"] = starts["shift-y"] + _count(_LATERAL)
-    count = {"background": _count(degree) - 1, "gain": 1}.get(what, _count(degree))
+    surface, lateral = _count(_HIGHEST), _count(_LATERAL)
+    starts = {
+        "background": 1,
+        "shift-x": surface,
+        "shift-y": surface + lateral,
+        "gain": surface + 2 * lateral,
+    }
+    count = _count(degree) - (what == "background")
     return tuple(range(starts[what], starts[what] + count))
 
 
 def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levelling:
     """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
-    errors: dict[Levelling, float] = {}
-    for name in LEVELLED:
-        levelled = model.model_copy(update={"levelling": name})
+    # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
+    weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
+
+    def error(levelling: Levelling) -> float:
+        levelled = model.model_copy(update={"levelling": levelling})
         rests = []
         for scan, prediction in pairs:
             at = _thinned(scan.usable)
             rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
-            shapes = _polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at]
-            rests.append(np.linalg.lstsq(shapes @ shapes.T, shapes @ rest, rcond=None)[0])
-        # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
-        weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
-        errors[name] = float((np.var(rests, axis=0) * weights)[1:].sum())
-    return min(errors, key=lambda name: errors[name])
+            rests.append(least_squares(_polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at], rest))
+        return float((np.var(rests, axis=0) * weights)[1:].sum())
+
+    return min(LEVELLED, key=error)
 
 
 def _displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
     """A predicted print looked up where the displacements of these parts say, (ny, nx) µm."""
     prediction = np.asarray(prediction_um, np.float64)
-    known = [(part, part.coefficients.get(label_of(scan, part.by))) for part in parts]
-    moves = [(part, own) for part, own in known if own and part.what in ("shift-x", "shift-y")]
+    moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
     if not moves:
         return prediction
     y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in scan.shape), indexing="ij")
     places = {"shift-y": y, "shift-x": x}
-    for part, own in moves:
-        places[part.what] += np.tensordot(own, _polynomials(scan.shape, part.degree), axes=1) / scan.pitch_um
+    for part in moves:
+        places[part.what] += part.map_um(scan) / scan.pitch_um
     return map_coordinates(prediction, [*places.values()], order=3, mode="nearest")
 
 
@@ -308,8 +312,7 @@ def _levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Fl
         return field
     shapes = _polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
     basis = shapes[:, usable]
-    fitted = np.linalg.solve(basis @ basis.T, basis @ field[usable])
-    surface = np.tensordot(fitted[1:], shapes[1:], axes=1)
+    surface = np.tensordot(least_squares(basis, field[usable])[1:], shapes[1:], axes=1)
     return field - surface + surface[usable].mean()
 
 
@@ -338,7 +341,3 @@ def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
     """Number of the inner fold of each scan, dealt by a hash of its id."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])
-
-
-def _field_um(scan: PrintedScan) -> tuple[float, float]:
-    return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 from litho_data.foundation.errors import unknown_name
 from litho_data.foundation.results import Record
@@ -19,7 +19,6 @@ POLICIES: dict[Policy, Terms] = {
     "full": frozenset({"offset", "gain", "bow"}),
     "full+rows": frozenset({"offset", "gain", "bow", "layout-rows"}),
 }
-assert tuple(POLICIES) == get_args(Policy)
 
 
 def policy_terms(policy: str) -> Terms:
@@ -41,16 +40,15 @@ class NuisanceProtocol(Record):
     depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
     learned on the training scans was added to the predictions, ``shared`` if they went through the whole
     measurement model, learned there with the printer; nothing of it is fitted to the scored scan.
-    In older result files ``line_gap_px`` is None, as line offsets came from stripes beside the scored pixels,
-    and so is ``border_px``: 0 in a benchmark, 8 in the loop.
+    No pixel is left out for lying at the edge of a scan: ``border_px``.
     """
 
     policy: Policy = "offset"
     k: float = 1.0
     block_px: int = Blocks().block_px
     buffer_px: int = Blocks().buffer_px
-    line_gap_px: int | None = None
-    border_px: int | None = None
+    line_gap_px: int = Blocks().line_gap_px
+    border_px: Literal[0] = 0
     seed: int = 0
     background: BackgroundUse = "none"
 
@@ -65,10 +63,4 @@ class NuisanceProtocol(Record):
     @property
     def blocks(self) -> Blocks:
         """Which pixels are fitted on and which are scored."""
-        return Blocks(
-            self.block_px,
-            self.buffer_px,
-            Blocks().line_gap_px if self.line_gap_px is None else self.line_gap_px,
-            self.border_px or 0,
-            self.seed,
-        )
+        return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)

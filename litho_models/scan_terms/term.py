@@ -77,8 +77,6 @@ class ScanTerm:
         maps: pixels to (k, n), each map of zero mean over the scan unless it is the datum itself.
         lines: for offsets of lines: (shape, scan line index) to the index of the line under each pixel.
         frame: for offsets of lines: whose lines they are.
-        may_be_shared: whether the mean over scans could be a property of the printer.
-        role: whose it is.
     """
 
     name: str
@@ -88,15 +86,13 @@ class ScanTerm:
     maps: Callable[[TermPixels], FloatMap] | None = None
     lines: Callable[[tuple[int, ...], LineIndex | None], LineIndex] | None = None
     frame: str = ""
-    may_be_shared: bool = False
-    role: Literal["measurement", "nuisance", "control"] = "measurement"
 
 
 def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
     """The smooth maps of some terms, in the order of the catalogue: (k, n)."""
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
     count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
-    return np.concatenate(chosen) if chosen else np.empty((0, count))
+    return np.concatenate([np.empty((0, count)), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
@@ -161,10 +157,6 @@ def row_index(shape: tuple[int, ...]) -> LineIndex:
     return np.broadcast_to(np.arange(shape[0], dtype=np.intp)[:, None], shape)
 
 
-def _column_index(shape: tuple[int, ...]) -> LineIndex:
-    return np.broadcast_to(np.arange(shape[1], dtype=np.intp)[None, :], shape)
-
-
 def _drift(pixels: TermPixels) -> FloatMap:
     """Exponential creep after the scan starts; what is slower still lies in the bow."""
     time = pixels.time
@@ -190,17 +182,14 @@ CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 # In the order in which they are tested.
 _BUILT_IN = (
     ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
-    ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None], may_be_shared=True),
-    ScanTerm(
-        "bow", "tilt-bow", "µm", ("x", "y", "x²", "xy", "y²"), maps=lambda p: p.smooth, may_be_shared=True
-    ),
+    ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None]),
+    ScanTerm("bow", "tilt-bow", "µm", ("x", "y", "x²", "xy", "y²"), maps=lambda p: p.smooth),
     ScanTerm(
         "drift",
         "slow-drift",
         "µm",
         tuple(f"creep over {decay:g} of the scan" for decay in CREEP_DECAYS.values()),
         maps=_drift,
-        may_be_shared=True,
     ),
     ScanTerm(
         "warp",
@@ -215,7 +204,6 @@ _BUILT_IN = (
         "px",
         tuple(f"shift {axis} by {by}" for axis in "yx" for by in ("y² - 1/3", "xy", "x² - 1/3")),
         maps=_distortion,
-        may_be_shared=True,
     ),
     ScanTerm(
         "scan-lines",
@@ -232,16 +220,14 @@ _BUILT_IN = (
         ("offset of a row",),
         lines=lambda shape, line: row_index(shape),
         frame="the layout's rows",
-        role="nuisance",
     ),
     ScanTerm(
         "layout-columns",
         None,
         "µm",
         ("offset of a column",),
-        lines=lambda shape, line: _column_index(shape),
+        lines=lambda shape, line: row_index(shape[::-1]).T,
         frame="the layout's columns",
-        role="control",
     ),
 )
 

@@ -52,13 +52,8 @@ def estimate_scan_terms(
         basis = term_maps(TermPixels(prediction), terms).reshape(-1, *scan.shape)
         smooth = np.tensordot(own, basis, axes=1)
         if line_terms(terms):
-            smooth = smooth + _row_offsets(scan, prediction, smooth)
+            rows = row_index(scan.shape)
+            residual = np.where(scan.usable, scan.height_um - prediction - smooth, 0.0)
+            smooth = smooth + shrunk_line_offsets(residual, scan.usable, rows, Blocks().block_px)[0][rows]
         maps.append(smooth.astype(np.float32))
     return maps
-
-
-def _row_offsets(scan: PrintedScan, prediction: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    residual = np.where(scan.usable, scan.height_um - prediction - smooth, 0.0)
-    rows = row_index(scan.shape)
-    offsets, _, _ = shrunk_line_offsets(residual, scan.usable, rows, Blocks().block_px)
-    return offsets[rows]

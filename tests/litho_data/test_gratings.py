@@ -9,7 +9,7 @@ from litho_data import build_dataset, open_store
 from litho_data.build.gratings import grating_scan, grating_scans
 from litho_data.cards.card import KnownGrating
 from litho_data.foundation.errors import InputError
-from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
 from litho_data.virtual_fab.jobs import jobs_of_card
@@ -78,8 +78,9 @@ def test_a_grating_is_a_row_of_a_plan_and_a_table_of_the_report(tmp_path):
     write_layout(plan, "N0F1", np.zeros((128, 128), np.uint8))
     write_layout(plan, "N1F1", random_layout((128, 128), levels=13, pitch_um=0.1, seed=1))
     write_table(plan, ("id", "order", "use"), [("N0F1", 0, "grating"), ("N1F1", 1, "dataset")])
-    text = CardText("p", "p", 0.1, 0.1, 13, (12.8, 12.8), slow_axis="y", grating_um=1.0)
-    card = text.write(plan)
+    about = {"pitch_um": 0.1, "level_height_um": 0.1, "levels": 13, "scan_size_um": (12.8, 12.8)}
+    tables = {"ids": {"table": TABLE_NAME}, "write": {"slow_axis": "y"}, "grating": {"period_um": 1.0}}
+    card = write_card(plan, name="p", title="p", **about, **tables)
     jobs = jobs_of_card(card)
     assert (jobs[0].use, jobs[0].grating_um) == ("grating", 1.0)
     printed = simulate(tmp_path / "fab", jobs=jobs, seed=2, knobs=["piezo-nonlinearity=0.05"])

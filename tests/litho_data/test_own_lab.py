@@ -16,7 +16,9 @@ from litho_data.cards.card import load_card
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe
+from litho_data.register.refine import interior_of
 from litho_data.store import open_store
+from tests.litho_data.campaigns import write_campaign
 from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, RIM_PX, errors_nm, write_lab
 
 BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
@@ -55,6 +57,8 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert max(errors.values()) < MOST_NM, errors
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
     assert f"check {MIRRORED}: a mirror image" in build.stderr
+    # Level 0 of these prints stands two levels above the substrate.
+    assert "check all scans: their outermost pixels lie" in build.stderr
     scan = store.scan("B3")
     assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
     # Around it models see the substrate, and its measured heights stand where the scan has them.
@@ -63,6 +67,14 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert not scan.mask_level[rim].any()
     assert scan.mask_level[~rim].any(axis=None)
     assert scan.valid[rim].mean() > 0.9
+
+
+def test_pixels_whose_surroundings_are_unknown_are_left_out(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, 1, more='[write]\nsurround = "unknown"')
+    build_dataset(card, tmp_path / "prints.zarr")
+    scan = open_store(tmp_path / "prints.zarr").scan("P11")
+    assert scan.surround == "unknown"
+    np.testing.assert_array_equal(scan.valid, interior_of(scan.shape))
 
 
 def other_unit(card: Path) -> None:

@@ -92,7 +92,7 @@ def test_the_law_can_fail(tmp_path: Path, seed: int) -> None:
 # Rows of the page's table by how they begin: a writer, or real files of the other tests.
 TRIED = {
     "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "SXM": sxm, "TIFF": tiff, "GSF": gsf,
-    "NPY, NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,
+    "NPY": numpy_archive, "NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,
     "HDF5 of JPK": nhf, "HDF5 of any": hdf5,
     "SPM": afm_files.write_spm, "SUR, MNT": digital_surf, "JPK": afm_files.write_jpk, "Park Systems": park,
     "X3P": afm_files.write_x3p, "SDF": sdf, "BCR": bcr, "STP, TOP": INTACT, "PNG, BMP": "test_readers_layout",

@@ -8,9 +8,11 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+import xarray as xr
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import list_channels, read_scan
+from litho_data.readers.gsf import gsf_bytes
 from tests.litho_data import afm_files
 from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 
@@ -52,6 +54,10 @@ def test_a_picture_beside_an_unknown_private_tag_is_no_map(tmp_path: Path) -> No
         ({"scaling": 2.0}, "scaling = 2.0"),
         ({"Z_offset": 1.0, "gain": 3.0}, "gain = 3.0"),
         ({"calibration": [1.0, 2.0]}, r"calibration = \[1.0, 2.0\]"),
+        ({"sensitivity": 0.1}, "sensitivity = 0.1"),
+        ({"nm_per_count": 0.1}, "nm_per_count = 0.1"),
+        ({"z_resolution": 0.1}, "z_resolution = 0.1"),
+        ({"to_m": 1e-9}, "to_m = 1e-09"),
     ],
 )
 def test_numbers_beside_an_array_are_applied_or_named(tmp_path: Path, attributes: dict, message: str) -> None:
@@ -63,6 +69,13 @@ def test_numbers_beside_an_array_are_applied_or_named(tmp_path: Path, attributes
     # The other channel is as good as before.
     np.testing.assert_array_equal(read_scan(path, channel="other", unit="um").height_um, 2 * HEIGHT_UM)
     assert [bool(one.problem) for one in list_channels(path)] == [True, False]
+
+
+def test_numbers_beside_counts_may_be_their_calibration(tmp_path: Path) -> None:
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("z", data=np.ones(SHAPE, np.uint16)).attrs.update({"m": 1e-4, "b": 0.0})
+    refused(path, "b = 0.0, m = 0.0001")
 
 
 def test_arrays_show_what_runs_along_x(tmp_path: Path) -> None:
@@ -128,6 +141,89 @@ def test_a_caller_may_say_that_no_pixel_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
     path.write_text(ROWS.replace("0.0310", "-9999"))
     assert read_scan(path, unit="nm", missing=[]).height_um.min() == -9.999
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("# Height [V]", "no height channel.*V"),
+        ("# Heights in 0.1 nm", "a scale in the header.*0.1 nm"),
+        ("# Heights (x 10 nm)", "a scale in the header.*10 nm"),
+        ("# multiply by 10 to get nm", "a scale in the header.*multiply by 10"),
+        ("# 1 count = 0.1 nm", "a scale in the header.*1 count = 0.1 nm"),
+        ("# Height image in um", "unit, got 'nm', wanted 'um'"),
+        ("height_um", "unit, got 'nm', wanted 'um'"),
+        ("Units of height: microns", "unit, got 'nm', wanted 'microns'"),
+        ("# units: nm\n# z-units: um", "unit, got 'nm', wanted 'um'"),
+        (", ".join(f"h{k} (um)" for k in range(4)), "unit, got 'nm', wanted 'um'"),
+    ],
+)
+def test_what_words_say_of_the_heights_is_not_passed_over(tmp_path: Path, head: str, message: str) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text(f"{head}\n{ROWS}")
+    refused(path, message, unit="nm")
+
+
+def test_blanks_between_thousands_make_no_columns(tmp_path: Path) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text("\n".join("\t".join(f"1 0{value:05.2f}" for value in 10 * row) for row in HEIGHT_UM))
+    refused(path, "line 1.*no marks of thousands")
+
+
+def test_axes_in_the_last_row_and_column_are_no_heights(tmp_path: Path) -> None:
+    path = tmp_path / "scan.csv"
+    table = np.pad(np.tile(HEIGHT_UM, (2, 2)), ((0, 1), (0, 1)))
+    table[-1], table[:, -1] = 0.2 * np.arange(table.shape[1]), 0.2 * np.arange(len(table))
+    np.savetxt(path, table, fmt="%.4f", delimiter=",")
+    refused(path, "axes in the last row and column")
+
+
+def test_json_beside_a_page_is_read_like_words(tmp_path: Path) -> None:
+    path = tmp_path / "scan.tif"
+    tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), metadata={"unit": "nm"})
+    assert read_scan(path).unit == "nm"
+    tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), metadata={"scale": 10})
+    refused(path, "scale = 10")
+
+
+def test_what_lies_beside_a_map_in_an_archive_is_heeded(tmp_path: Path) -> None:
+    path = tmp_path / "scan.npz"
+    y, x = (0.2 * np.arange(count) for count in SHAPE)
+    np.savez(path, z=HEIGHT_UM.T, x=x, y=y, unit="um")
+    scan = read_scan(path)
+    np.testing.assert_array_equal(scan.height_um, HEIGHT_UM)
+    assert scan.require_pitch() == pytest.approx((0.2, 0.2))
+    for beside, message in (({"scale": 10.0}, "scale = 10"), ({"mask": HEIGHT_UM > 0}, "mask 'mask'")):
+        np.savez(path, z=HEIGHT_UM, **beside)
+        refused(path, message)
+
+
+def test_a_scale_in_the_header_of_a_simple_field_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scan.gsf"
+    path.write_bytes(gsf_bytes(HEIGHT_UM, None).replace(b"ZUnits = m", b"ZScale = 5"))
+    refused(path, "ZScale = 5")
+
+
+@pytest.mark.parametrize(
+    "says", [("axis", "X", "Y"), ("standard_name", *(f"projection_{k}_coordinate" for k in "xy"))]
+)
+def test_axes_may_be_told_by_attributes(tmp_path: Path, says: tuple[str, str, str]) -> None:
+    path, (key, x, y) = tmp_path / "scan.nc", says
+    lines = {name: 0.2 * np.arange(count) for name, count in zip("ba", SHAPE, strict=True)}
+    array = xr.DataArray(HEIGHT_UM.T, dims=("a", "b"), name="height_um", coords=lines)
+    array["a"].attrs, array["b"].attrs = {key: x, "units": "um"}, {key: y, "units": "um"}
+    array.to_netcdf(path, engine="scipy")
+    # The name states the unit.
+    scan = read_scan(path)
+    np.testing.assert_array_equal(scan.height_um, HEIGHT_UM)
+    assert scan.require_pitch() == pytest.approx((0.2, 0.2))
+
+
+def test_a_mask_beside_a_map_is_not_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file["z"], file["seen"] = HEIGHT_UM, HEIGHT_UM > 0
+    refused(path, "mask '/seen'")
 
 
 def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:

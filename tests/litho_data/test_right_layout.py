@@ -72,6 +72,22 @@ def swap(folder: Path, one: str, other: str) -> None:
         path.write_bytes(text)
 
 
+@pytest.mark.parametrize(
+    ("mode", "rim", "alone"), [("nearest", 0, False), ("constant", 0, True), ("constant", 2, False)]
+)
+def test_a_field_alone_is_told_by_its_outermost_pixels(mode: str, rim: int, alone: bool) -> None:
+    prints = doses(3, 0)
+    for one in prints.values():
+        # Beyond the layout its outermost levels go on, or there is the substrate, which a rim shows.
+        level = np.pad(one["mask_level"].astype(float), 20, mode="edge" if mode == "nearest" else "constant")
+        height_um = (
+            0.1 * gaussian_filter(level, 2.5)[20 - rim : rim - 20 or None, 20 - rim : rim - 20 or None]
+        )
+        one |= {"mask_level": np.pad(one["mask_level"], rim), "height_um": height_um.astype(np.float32)}
+    found = prints_of([record_of(name, one) for name, one in prints.items()], lambda name: prints[name])
+    assert {one.edge_times > 3 for one in found} == {alone}
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("layouts", [1, 3])
 def test_doses_that_were_mixed_up_are_named(layouts: int, seed: int) -> None:

@@ -14,12 +14,10 @@ from litho_data.roughness import (
     exponential_correlation,
     gaussian_correlation,
     groove_depth,
-    print_roughness,
     psd_along,
     psd_radial,
     retained_variance,
     retained_variance_by_rows,
-    split_noise,
     sq_uncertainty_nm,
     stair_steps,
 )
@@ -193,30 +191,6 @@ class TestStepHeight:
             groove_depth(np.zeros((4, 100)), PITCH_UM, left_um=1, right_um=6)
         with pytest.raises(InputError, match="ascending"):
             stair_steps(np.zeros((4, 100)), PITCH_UM, edges_um=[5, 4])
-
-
-class TestNoise:
-    def test_lines_and_pixels_are_told_apart(self):
-        rng = np.random.default_rng(6)
-        height = 1e-3 * (3 * rng.standard_normal((512, 512)) + 7 * rng.standard_normal((512, 1)))
-        found = split_noise(height)
-        # sd of a MAD over 511 independent steps: 1.17/√(2·511)·… ≈ 5 %; pixels are 500 times more.
-        assert found.pixel_nm == pytest.approx(3, rel=0.02)
-        assert found.line_nm == pytest.approx(7, rel=0.15)
-        assert found.column_nm < 0.5
-        assert found.pixel_slow_nm == pytest.approx(np.hypot(3, 7), rel=0.1)
-
-    def test_fast_axis_along_y_is_the_transpose(self):
-        height = np.random.default_rng(7).standard_normal((64, 80))
-        assert split_noise(height.T, fast_axis="y") == split_noise(height)
-
-    def test_print_roughness_is_the_quadrature_difference(self):
-        flat = gaussian_surface((128, 128), 0.3, 8)
-        substrate = 0.1 * gaussian_surface((128, 128), 0.2, 9)
-        found = print_roughness(flat, substrate)
-        assert found.print_nm**2 + found.substrate_nm**2 == pytest.approx(found.flat_nm**2)
-        with pytest.raises(InputError, match="roughness of the substrate"):
-            print_roughness(substrate, flat)
 
 
 class TestLevellingBias:

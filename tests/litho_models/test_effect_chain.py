@@ -14,7 +14,7 @@ from litho_models.models import build_model
 pytestmark = pytest.mark.numerics
 
 LAYOUT = (torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(0)) * 12).floor() / 10
-MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement"]
+MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement" and not e.per_scan]
 
 
 def chain_of(effects: dict[str, dict[str, float]]) -> EffectChain:

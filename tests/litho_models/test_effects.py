@@ -12,11 +12,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
 from litho_models.effects.effect import Effect, Parameter
+from litho_models.scan_terms import SCAN_TERMS
 
 pytestmark = pytest.mark.numerics
 
 PITCH_UM = 0.1
-EFFECTS = list(CATALOGUE.values())
+EFFECTS = [effect for effect in CATALOGUE.values() if not effect.per_scan]
 PER_EFFECT = pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
 
 
@@ -26,7 +27,7 @@ def field(seed: int = 0) -> tuple[torch.Tensor, FieldContext]:
     coarse = torch.randint(0, 13, (1, 1, 9, 11), generator=generator).double() * 0.1
     layout = torch.nn.functional.interpolate(coarse, size=(36, 44), mode="nearest")
     height = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layout, (2,) * 4, mode="replicate"), 5, 1)
-    return height, FieldContext(layout, PITCH_UM, 1.2, order=0.3, seed=5)
+    return height, FieldContext(layout, PITCH_UM, 1.2, order=0.3)
 
 
 def input_of(effect: Effect) -> tuple[torch.Tensor, FieldContext]:
@@ -133,15 +134,14 @@ def test_parameters_have_units_and_bounds_that_hold_their_values(effect: Effect)
             assert parameter.lower <= parameter.null <= parameter.upper
             assert parameter.typical != parameter.null
     assert (effect.stage == "measurement") == (effect.role == "measurement")
-    if not effect.per_scan:
-        assert effect.trials
+    assert effect.trials
     for trial in effect.trials:
         assert effect.with_values(trial) != effect.off_values()
 
 
 def test_screened_effects_and_forward_order() -> None:
     assert {effect.name for effect in screened_effects()} < set(CATALOGUE)
-    assert in_forward_order(["tilt-bow", "vignetting"]) == ["vignetting", "tilt-bow"]
+    assert in_forward_order(["tip-dilation", "vignetting"]) == ["vignetting", "tip-dilation"]
 
 
 def test_the_tip_is_tried_at_the_radius_that_the_store_knows() -> None:
@@ -389,14 +389,14 @@ def test_a_field_goes_on_beyond_its_edge_for_what_is_narrow_too() -> None:
     assert torch.equal(closed, of_whole[..., 20:-20, 20:-20])
 
 
-def test_stripes_follow_the_scan_lines_with_the_stated_spread() -> None:
-    flat = torch.zeros(1, 1, 2000, 4, dtype=torch.float64)
-    striped = get_effect("scan-line-stripes")(
-        flat, {"sd_um": 0.008}, FieldContext(flat, PITCH_UM, 1.2, seed=3)
-    )
-    assert float(striped.std(dim=-1).max()) == 0.0
-    # Relative error of a standard deviation from n draws: 1 / sqrt(2 n) = 1.6 %; four of them.
-    assert float(striped[..., 0].std()) == pytest.approx(0.008, rel=0.065)
+def test_what_single_scans_add_has_scan_terms_and_enters_no_model() -> None:
+    array, context = field()
+    own = [effect for effect in CATALOGUE.values() if effect.per_scan]
+    assert {effect.name for effect in own} == {term.effect for term in SCAN_TERMS.values()} - {None}
+    for effect in own:
+        assert not effect.trials
+        with pytest.raises(InputError, match="one of single scans"):
+            effect(array, {}, context)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])

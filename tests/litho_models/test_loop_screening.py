@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.effects.effect import Parameter, of_development
+from litho_models.effects.effect import Effect, Parameter
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
 from litho_models.scan_terms.groups import ALL
@@ -103,9 +103,12 @@ def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
 
 
 def _effect():
-    return of_development(
+    return Effect(
         name="made",
         title="made",
+        stage="development",
+        role="process",
+        acts_on="height",
         parameters={
             "a": Parameter("1", 0.0, 1.0, 0.1),
             "b": Parameter("1", -1.0, 2.0, 1.1, null=1.0),

@@ -46,9 +46,8 @@ from litho_models.planning.layouts import Limits, as_tensor, climb, score, start
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question, open_questions
 from litho_models.planning.power import Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
+from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals
 from litho_models.planning.record import NextPrint, PlannedQuestion
-from litho_models.planning.rival_fits import fit_rivals
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
@@ -614,7 +613,7 @@ def test_a_question_below_the_models_own_error_is_declared_before_printing(
     def asked(form_nm: float | None) -> PlannedQuestion:
         question = slope_question(form_nm=form_nm)
         own = Rivalry(question, base_model(), rivalry.printing, rivalry.noise)
-        return of_rivals(own, prints, prints, {}, 4)
+        return of_rivals(own, {}, prints, prints, 4)
 
     plain = asked(None)
     assert plain.status == "decides"

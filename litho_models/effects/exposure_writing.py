@@ -1,0 +1,193 @@
+"""Exposure: what place and order in the write field leave behind, and the motion of writing."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
+from litho_models.effects.filters import (
+    add_filtered,
+    add_warp,
+    centred_lag,
+    dose_nearby,
+    gradient,
+    trailing_response,
+)
+
+_TAIL_LENGTHS = 6
+# A slower wave is no ripple: maps of the field look like it.
+_SLOWEST_PER_UM = 0.19
+_RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
+
+
+@of_exposure(
+    "dose falling towards the edge of the write field",
+    {"strength": Parameter("1", 0.0, 0.6, 0.1)},
+    source="aperture of scanning objectives; quadratic in the field radius",
+    separating="print one layout at the centre and at the edge of the write field",
+)
+def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = M (1 - v r² / R²): less light towards the edge of the write field."""
+    y, x = context.centred_um()
+    return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
+
+
+@of_exposure(
+    "focus surface tilted or curved over the write field",
+    {name: Parameter("µm", -0.6, 0.6, 0.05) for name in ("tilt_x_um", "tilt_y_um", "curvature_um")},
+    acts_on="height",
+    source="Ellingen 2023, JOM 3(4) 043501",
+    separating="leave bare substrate in every field as a reference for the levelling",
+)
+def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + 1[M > 0] (a x + b y + c r²), coordinates in units of R: focus and stage tilt over the field."""
+    y, x = context.centred_um()
+    radius = context.radius_um()
+    tilt = values["tilt_x_um"] * x / radius + values["tilt_y_um"] * y / radius
+    surface = tilt + values["curvature_um"] * (x * x + y * y) / radius**2
+    return height + (context.layout_um > 0).to(height.dtype) * surface
+
+
+@of_exposure(
+    "laser power drifting while the set is written",
+    {"drift": Parameter("1 over the set", -0.5, 0.5, 0.1)},
+    role="nuisance",
+    source="linear in the writing order",
+    separating="repeat one layout at the start, the middle and the end of the set; log the laser power",
+    needs=("order",),
+)
+def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = M (1 + ρ t), t the place in the writing order from -0.5 to 0.5."""
+    return layout * (1 + values["drift"] * context.order)
+
+
+@of_exposure(
+    "writing started below the surface of the substrate",
+    {
+        "depth_um": Parameter("µm", 0.0, 0.8, 0.1, tried=(0.05, 0.15, 0.3)),
+        "substrate_um": Parameter("µm", -0.3, 0.5, 0.05, "shape"),
+        "shrinkage": Parameter("1", 0.0, 0.9, 0.3, "shape"),
+        "length_um": Parameter("µm", 0.3, 3.0, 1.5, "shape"),
+    },
+    acts_on="height",
+    source="search of the interface before writing; clipping at the substrate",
+    separating="leave bare substrate in every field",
+)
+def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """max(H - z, H_s) where H > H_s, the substrate: writing starts below it, and that part is lost.
+
+    The part would have shrunk like the rest, z = z0 (1 - k (1 - u)), u the relative nominal height nearby.
+    """
+    substrate_um = values["substrate_um"]
+    thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
+    lost_um = values["depth_um"] * (1 - thinned)
+    return torch.where(height > substrate_um, torch.maximum(height - lost_um, substrate_um), height)
+
+
+@of_exposure(
+    "beam lagging behind the scan command along the written lines",
+    {
+        "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    source="first-order lag of the deflection, l = speed x time constant",
+    separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+)
+def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The beam follows the command late: one-sided exponential of length l = v τ, without its mean delay."""
+    length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along = fx if context.slow_axis == "y" else fy
+        return centred_lag(direction * along, length, pitch) - 1
+
+    return add_filtered(layout, transfer_minus_one, pitch, _TAIL_LENGTHS * float(length.detach()) + pitch)
+
+
+@of_exposure(
+    "written lines that begin and end too late",
+    {axis: Parameter("µm", -0.6, 0.6, 0.1) for axis in ("along_x_um", "along_y_um")},
+    trials=({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1}),
+    source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
+    separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
+)
+def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line loses δ at both ends, or gains it.
+
+    What an edge loses is right in its area; the spot, which is wider than δ, makes its shape.
+    """
+    along_y, along_x = gradient(layout, context.pitch_um)
+    return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
+
+
+@of_exposure(
+    "scanner of the printer running unevenly along the written lines",
+    {"strength": Parameter("1", -0.05, 0.05, 0.005)},
+    source="distortion of the write field by a galvo or a stage, quadratic along the line",
+    separating="scan each print at 0 and 90 degrees; scan a calibration grating",
+)
+def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """M(x + c (r² / 3 - x²) / 2R) along the written lines, x from the centre of a field of half width r.
+
+    That is c x (1 - x / 2R) over the write field, R its half width, without what registration has taken out.
+    """
+    lines_along_x = context.slow_axis == "y"
+    y, x = context.scan_position()
+    half_um = context.whole_shape()[1 if lines_along_x else 0] * context.pitch_um / 2
+    bulge_um = values["strength"] * half_um**2 / (2 * context.radius_um())
+    along = bulge_um * (1 / 3 - (x if lines_along_x else y) ** 2)
+    shifts = (0 * y, along) if lines_along_x else (along, 0 * x)
+    return add_warp(layout, *shifts, context.pitch_um)
+
+
+@of_exposure(
+    "resist remembering what was written just before",
+    {
+        "strength": Parameter("1", -0.6, 0.6, 0.05),
+        "length_um": Parameter("µm", 0.4, 20.0, 3.0, "shape", tried=(1.0, 3.0, 9.0)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    stage="resist",
+    source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
+    separating="print the same layout with the writing order reversed",
+)
+def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: the lines before starve the resist."""
+    strength, length, direction = values["strength"], values["length_um"], values["direction"]
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along = fy if context.slow_axis == "y" else fx
+        return -strength * trailing_response(direction * along, length, context.pitch_um)
+
+    reach_um = _TAIL_LENGTHS * float(length.detach())
+    starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
+    # Where another effect has left a negative dose, that is not for this one to mend.
+    least = layout.clamp(max=0)
+    return least + torch.relu(starved - least)
+
+
+@of_exposure(
+    "ripples at the hatching pitch",
+    {
+        "cosine_um": Parameter("µm", -0.1, 0.1, 0.01),
+        "sine_um": Parameter("µm", -0.1, 0.1, 0.01),
+        "frequency_per_um": Parameter("1/µm", _SLOWEST_PER_UM, 0.7, 0.3, "shape", tried=_RIPPLES_PER_UM),
+    },
+    role="nuisance",
+    acts_on="height",
+    source="ripples of the paper's noise figure, at 0.1 µm pitch",
+    separating="rescan at 25 nm per pixel",
+)
+def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
+
+    Sampled at the pixel dx, they show at f = |1/p - 1/dx|. The write field gives them their phase,
+    the same in every print.
+    """
+    y, x = context.centred_um()
+    phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)
+    ripple = values["cosine_um"] * torch.cos(phase) + values["sine_um"] * torch.sin(phase)
+    return height + (context.layout_um > 0).to(height.dtype) * ripple

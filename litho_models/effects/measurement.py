@@ -1,0 +1,167 @@
+"""Measurement: the tip, whose flanks touch before its end does, the feedback, and the lateral scanner."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
+from litho_models.effects.filters import add_blur, add_warp
+
+# Cubic interpolation half-way between four neighbours.
+_MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
+_SHARPEST_UM = 1e-3
+# Of the radius, along the sharper axis of an asymmetric tip.
+_SHARPER = 0.25
+_BLUR_REACH_UM = 4.0
+
+
+@of_microscope(
+    "probe lagging behind the surface along the fast axis",
+    {
+        "length_um": Parameter("µm", 0.0, 1.5, 0.2, tried=(0.15, 0.4)),
+        "rising": Parameter("1", 0.0, 1.0, 0.5, "shape", tried=(1.0, 0.4)),
+        "direction": Parameter("1", -1.0, 1.0, 1.0, "choice", tried=(1.0, -1.0)),
+    },
+    source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
+    separating="compare trace and retrace; scan at 0 and 90 degrees",
+    reverses=("direction",),
+)
+def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The probe follows late along the fast axis, mean delay taken out: z += (H - z) / (1 + l / dx).
+
+    The length l holds on the way down. On the way up, where the surface pushes, it is a part of it:
+    with 1 the probe is a linear filter, below 1 it parachutes off falling edges. The delay is one of time:
+    with smaller pixels it is shorter.
+    """
+    length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
+    rising = length * values["rising"]
+    forward = 1 if values["direction"] > 0 else -1
+    up, down = 1 / (1 + rising / pitch), 1 / (1 + length / pitch)
+    first, *columns = height.unbind(-1)[::forward]
+    followed = [first]
+    for column in columns:
+        error = column - followed[-1]
+        followed.append(followed[-1] + torch.where(error > 0, up, down) * error)
+    late = torch.stack(followed[::forward], dim=-1)
+    delay = forward * (length + rising) / 2
+    return add_warp(late, 0 * delay, delay, pitch)
+
+
+@of_microscope(
+    "scanner running unevenly along a line",
+    {"strength": Parameter("1", -0.05, 0.05, 0.005)},
+    source="hysteresis of a piezo scanner, quadratic along the line",
+    separating="scan a calibration grating; scan at 0 and 180 degrees",
+    reverses=("strength",),
+)
+def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: its x axis runs fast in the middle of a line.
+
+    That is c x (1 - x / L) without its mean, which registration has taken out of a scan.
+    """
+    y, x = context.scan_position()
+    length_um = context.whole_shape()[1] * context.pitch_um
+    return add_warp(height, 0 * y, values["strength"] * length_um / 4 * (1 / 3 - x**2), context.pitch_um)
+
+
+@of_microscope(
+    "blur of the finished scan",
+    {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025, tried=(0.0025, 0.04))},
+    source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
+    separating="register with two interpolation kernels; scan with half the pixel size",
+)
+def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass.
+
+    Either is one of pixels: smaller ones blur less.
+    """
+    variance_um2 = values["variance_um2"] * context.pixel_size**2
+    return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
+
+
+@of_microscope(
+    "tip of finite radius widening tops",
+    {
+        "radius_um": Parameter("µm", 0.0, 2.0, 0.04),
+        "along": Parameter("1", _SHARPER, 1.0, 1.0, "choice"),
+        "across": Parameter("1", _SHARPER, 1.0, 1.0, "choice"),
+    },
+    trials=(
+        {"radius_um": 0.04},
+        {"radius_um": 0.4},
+        {"radius_um": 0.4, "across": _SHARPER},
+        {"radius_um": 0.4, "along": _SHARPER},
+    ),
+    source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
+    separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
+    of_tip=True,
+)
+def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """max over u of H(x - u) - u² / 2R, the path of a paraboloid; H + R |grad H|² / 2 to first order.
+
+    A tip may be sharper along the scan lines or across them: ``along`` and ``across`` are shares of R.
+    """
+    radius = values["radius_um"]
+    # The formula divides by the radius: a sharper tip is taken in proportion, down to none at all.
+    blunt = radius.clamp(min=_SHARPEST_UM)
+    # A paraboloid is the sum of two parabolas: the axes take their maxima one after the other.
+    across, along = blunt * values["across"], blunt * values["along"]
+    columns_done = _dilate_rows(height.transpose(-1, -2), across, context.pitch_um).transpose(-1, -2)
+    dilated = _dilate_rows(columns_done, along, context.pitch_um)
+    return height + radius / blunt * (dilated - height)
+
+
+def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
+    """Dilation of rows (..., x) by a parabola; the surface is straight between half pixels.
+
+    On a straight piece of slope s the tip touches at the distance R s from its axis, or at the end of
+    the piece that is nearest to it.
+    """
+    half_um, size = pitch_um / 2, height.shape[-1]
+    middles = _middles(height)
+    # Pieces to the right of each pixel, then of each middle.
+    slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
+    steepest = max(float(s.detach().abs().max()) for s in slopes)
+    reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
+    starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
+    rises = [_continued(part, reach_px, "constant") for part in slopes]
+    # A maximum changes as the piece does on which it stands: the search needs no gradient, for which every
+    # piece would have to be kept.
+    with torch.no_grad():
+        highest, on = height, torch.zeros_like(height, dtype=torch.int32)
+        touches = [radius_um * slope for slope in rises]
+        bend = float(-0.5 / radius_um)
+        for offset in range(-2 * reach_px, 2 * reach_px):
+            away_px, middle = divmod(offset, 2)
+            start, slope, touch = (
+                part[middle][..., reach_px + away_px :][..., :size] for part in (starts, rises, touches)
+            )
+            near_um = offset * half_um
+            touch = touch.clamp(near_um, near_um + half_um)
+            tip = start.add(slope, alpha=-near_um).addcmul_(touch, slope.add(touch, alpha=bend))
+            on.masked_fill_(tip > highest, offset)
+            highest = torch.maximum(highest, tip)
+    piece = on + 2 * (torch.arange(size, device=height.device) + reach_px)
+    start, slope = (torch.stack(part, dim=-1).flatten(-2).gather(-1, piece) for part in (starts, rises))
+    begins_um = on.to(height.dtype) * half_um
+    touch = (radius_um * slope).clamp(begins_um, begins_um + half_um)
+    return start + slope * (touch - begins_um) - touch**2 / (2 * radius_um)
+
+
+def _middles(rows: Tensor) -> Tensor:
+    """Values (..., x) half a pixel to the right of each: the cubic through four neighbours."""
+    padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
+    middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)
+    return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)
+
+
+def _next(rows: Tensor) -> Tensor:
+    return torch.cat([rows[..., 1:], rows[..., -1:]], dim=-1)
+
+
+def _continued(rows: Tensor, by_px: int, mode: str) -> Tensor:
+    return functional.pad(rows, (by_px, by_px, 0, 0), mode=mode)
