@@ -27,6 +27,7 @@ from litho_models.frozen.exporting import export_model
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze as freeze_model
 from tests.litho_data.campaigns import write_campaign
+from tests.litho_models.prints import make_scans, write_store
 from tests.stops import stopped_after, writes_of
 
 # What differs between two runs of one command.
@@ -44,10 +45,17 @@ _VOLATILE = {
 QUICK = {"variant": "paper", "steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
 
 
+def _campaign(folder: Path) -> Path:
+    return write_campaign(folder / "fab", count=2)
+
+
 def _store(folder: Path) -> Path:
-    card = write_campaign(folder / "fab", count=4, shape=(112, 124))
-    build_dataset(card, folder / "prints.zarr")
+    build_dataset(_campaign(folder), folder / "prints.zarr")
     return folder / "prints.zarr"
+
+
+def _scans(folder: Path) -> None:
+    write_store(folder / "prints.zarr", make_scans(4, 48))
 
 
 def simulate_prints(folder: Path) -> None:
@@ -102,12 +110,12 @@ def nothing(folder: Path) -> None:
 COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "simulate": (nothing, simulate_prints),
     "masks": (nothing, layouts),
-    "build": (_store, build),
+    "build": (_campaign, build),
     "import-pairs": (_pairs, build_pairs),
     "export-ro-crate": (_store, crate),
     "export-pairs": (_store, pairs),
-    "train-network": (_store, train_network),
-    "train-small": (_store, train_small),
+    "train-network": (_scans, train_network),
+    "train-small": (_scans, train_small),
     "freeze": (nothing, freeze),
     "export-model": (nothing, program),
 }

@@ -6,6 +6,8 @@ import re
 import shutil
 from pathlib import Path
 
+import pytest
+
 import litho_data
 import litho_design
 import litho_models
@@ -17,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results" / "neural-lithography"
 
 
+@pytest.mark.pictures
 def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     knobs = ["elliptical-psf=0.3", "write-order-memory=0.15"]
     litho_data.simulate(tmp_path / "fab", count=1, size_px=64, knobs=knobs)

@@ -17,7 +17,7 @@ TEXT = (ROOT / "README.md").read_text("utf-8")
 SMALLER = {
     "count=12, size_px=256": "count=3, size_px=128",
     '"layout.size_px": 256': '"search.iterations": 2, "search.polish_rounds": 0, '
-    '"window.yield_draws": 5, "layout.size_px": 128',
+    '"window.yield_draws": 5, "layout.size_px": 64',
 }
 
 

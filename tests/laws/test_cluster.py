@@ -99,7 +99,7 @@ def test_a_worker_of_other_software_or_other_files_is_refused(
 
 
 def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: Path) -> None:
-    card = write_campaign(tmp_path, count=4)
+    card = write_campaign(tmp_path)
     alone = build_dataset(card, tmp_path / "alone.zarr")
     killed: list[int] = []
 

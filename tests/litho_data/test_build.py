@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import errno
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,17 +70,6 @@ def test_building_again_with_other_workers_gives_the_same(own_campaign: Path) ->
     assert (again.sha256, again.root.attrs["manifest_sha256"]) == hashes
     assert again.computed_sha256() == again.sha256
     assert not list(own_campaign.glob(".*"))
-
-
-@pytest.mark.slow
-def test_a_dask_cluster_gives_the_same(campaign: Path, tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
-    with cluster:
-        result = build_dataset(
-            campaign / "card.toml", tmp_path / "prints.zarr", dask=cluster.scheduler_address
-        )
-    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
 
 
 def test_no_scheduler_is_bad_input(campaign: Path, tmp_path: Path) -> None:
@@ -244,28 +228,6 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
     steps = [step.op for _, step in read_steps(open_store(tmp_path / "prints.zarr"))["P11"]]
     assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample", "uncertainty"]
     assert replay(tmp_path / "prints.zarr")["same_hash"].all()
-
-
-def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) -> None:
-    out = tmp_path / "prints.zarr"
-    pieces = tmp_path / ".prints.zarr.partial" / "pieces"
-    call = f"build_dataset({str(campaign / 'card.toml')!r}, {str(out)!r})"
-    code = f"from litho_data.build.build import build_dataset; {call}"
-    process = subprocess.Popen([sys.executable, "-c", code])
-    deadline = time.monotonic() + 60
-    # A name that begins with a dot is of a record that is still being written.
-    while not list(pieces.glob("[!.]*.json")) and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.002)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not out.exists()
-    finished = len(list(pieces.glob("[!.]*.json")))
-    assert finished >= 1
-    result = build_dataset(campaign / "card.toml", out)
-    assert result.reused == finished
-    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
-    assert verify(out).findings == ()
-    assert not pieces.parent.exists()
 
 
 def test_a_full_disk_loses_neither_the_older_store_nor_the_scans_that_are_done(

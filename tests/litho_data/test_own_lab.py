@@ -49,7 +49,7 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert (tmp_path / "levelling" / "report.html").is_file()
     assert load_card(found.card).process.level == "card.recipe.toml"
     out = card.parent / "prints.zarr"
-    build = CliRunner().invoke(app, ["build", str(found.card), "--out", str(out), "--workers", "2"])
+    build = CliRunner().invoke(app, ["build", str(found.card), "--out", str(out)])
     assert build.exit_code == 0
     store = open_store(out)
     assert len(store) == 6
@@ -117,7 +117,7 @@ def test_a_wrong_card_is_named_in_the_first_box_and_in_the_terminal(
     card = lab(tmp_path, FEW, **{"more": BOW} | changed)
     if change is not None:
         change(card)
-    build_dataset(card, card.parent / "prints.zarr", workers=2)
+    build_dataset(card, card.parent / "prints.zarr")
     assert re.search(said, first_box(card))
     assert re.search(said.split(".*")[0], capsys.readouterr().err.replace("check ", ""))
 
@@ -125,7 +125,7 @@ def test_a_wrong_card_is_named_in_the_first_box_and_in_the_terminal(
 def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
     card = lab(tmp_path, FEW[:2], level_height_um="80", more=BOW)
     with pytest.raises(InputError, match=r"level_height_um, got 80 µm, where the prints rise by 0\.\d+ µm"):
-        build_dataset(card, card.parent / "prints.zarr", workers=2)
+        build_dataset(card, card.parent / "prints.zarr")
     assert not list(card.parent.glob("*.zarr"))
 
 

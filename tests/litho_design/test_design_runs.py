@@ -36,6 +36,18 @@ def target():
     return load_target("ring", 128)
 
 
+@pytest.fixture
+def tiny_settings(small_settings):
+    """A quarter of the pixels, for what does not look at the image."""
+    changes = {"layout": LayoutSettings(size_px=64), "optics": Optics(distance_um=12.0)}
+    return small_settings.model_copy(update=changes)
+
+
+@pytest.fixture
+def tiny_target():
+    return load_target("ring", 64)
+
+
 def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_settings, make_printer, target):
     printer = make_printer(small_settings.layout)
     before = printer.weights_sha256()
@@ -57,12 +69,12 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
 
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
 def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
-    tmp_path, small_settings, make_printer, target, monkeypatch, parametrisation
+    tmp_path, tiny_settings, make_printer, tiny_target, monkeypatch, parametrisation
 ):
-    search = small_settings.search.model_copy(update={"parametrisation": parametrisation})
-    settings = small_settings.model_copy(update={"search": search})
+    search = tiny_settings.search.model_copy(update={"parametrisation": parametrisation})
+    settings = tiny_settings.model_copy(update={"search": search})
     whole = design_hologram(
-        target, make_printer(settings.layout), tmp_path / "whole", settings=settings, announce=False
+        tiny_target, make_printer(settings.layout), tmp_path / "whole", settings=settings, announce=False
     )
     original, calls = HologramTask.objective, itertools.count()
 
@@ -74,13 +86,13 @@ def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
     monkeypatch.setattr(HologramTask, "objective", stop_at_25)
     with pytest.raises(KeyboardInterrupt):
         design_hologram(
-            target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
+            tiny_target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
         )
     monkeypatch.setattr(HologramTask, "objective", original)
     assert (tmp_path / "cut" / "checkpoint.pt").exists()
     assert not (tmp_path / "cut" / "design.json").exists()
     resumed = design_hologram(
-        target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
+        tiny_target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
     )
     assert resumed.files == whole.files
     assert resumed.predicted == whole.predicted
@@ -108,17 +120,17 @@ def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeyp
     assert run().earlier_seconds == 21
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target, monkeypatch):
+def test_a_damaged_checkpoint_is_refused(tmp_path, tiny_settings, make_printer, tiny_target, monkeypatch):
     def stopped(*given, **named):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr("litho_design.tasks.run.polish_levels", stopped)
         with pytest.raises(KeyboardInterrupt):
-            design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
+            design_hologram(tiny_target, make_printer(tiny_settings.layout), tmp_path, settings=tiny_settings)
     (tmp_path / "checkpoint.pt").write_text("half a file")
     with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete it"):
-        design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
+        design_hologram(tiny_target, make_printer(tiny_settings.layout), tmp_path, settings=tiny_settings)
 
 
 def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tmp_path):
@@ -145,18 +157,18 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
 
 @pytest.mark.parametrize("where", ["score", "write_design_report"])
 def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
-    tmp_path, small_settings, make_printer, target, monkeypatch, where
+    tmp_path, tiny_settings, make_printer, tiny_target, monkeypatch, where
 ):
     """Fewer iterations than between two checkpoints, stopped between the arrays and the record."""
-    search = small_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
-    settings = small_settings.model_copy(update={"search": search})
+    search = tiny_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
+    settings = tiny_settings.model_copy(update={"search": search})
 
     def stopped(*given, **named):
         raise KeyboardInterrupt
 
     def design(folder):
         return design_hologram(
-            target, make_printer(settings.layout), folder, settings=settings, announce=False
+            tiny_target, make_printer(settings.layout), folder, settings=settings, announce=False
         )
 
     with monkeypatch.context() as patch:
@@ -173,10 +185,10 @@ def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
 
 
 def test_a_model_that_changes_while_it_prints_leaves_no_design(
-    tmp_path, small_settings, make_printer, target
+    tmp_path, tiny_settings, make_printer, tiny_target
 ):
-    search = small_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
-    settings = small_settings.model_copy(update={"search": search})
+    search = tiny_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
+    settings = tiny_settings.model_copy(update={"search": search})
     printer = make_printer(settings.layout)
     simulate = printer.simulator.forward
 
@@ -186,7 +198,7 @@ def test_a_model_that_changes_while_it_prints_leaves_no_design(
 
     printer.simulator.forward = forward
     with pytest.raises(InputError, match=r"^model blur, got weights or buffers that changed"):
-        design_hologram(target, printer, tmp_path, settings=settings, announce=False)
+        design_hologram(tiny_target, printer, tmp_path, settings=settings, announce=False)
     assert not (tmp_path / "design.json").exists()
 
 
@@ -229,16 +241,16 @@ def test_the_estimate_of_a_resumed_run_leaves_out_what_is_done():
 
 
 def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
-    tmp_path, small_settings, make_printer, target
+    tmp_path, tiny_settings, make_printer, tiny_target
 ):
-    search = small_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
-    settings = small_settings.model_copy(update={"search": search})
+    search = tiny_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
+    settings = tiny_settings.model_copy(update={"search": search})
     printer = make_printer(settings.layout)
-    first = design_hologram(target, printer, tmp_path, settings=settings, announce=False)
-    assert design_hologram(target, printer, tmp_path, settings=settings, announce=False) == first
+    first = design_hologram(tiny_target, printer, tmp_path, settings=settings, announce=False)
+    assert design_hologram(tiny_target, printer, tmp_path, settings=settings, announce=False) == first
     other = settings.model_copy(update={"search": search.model_copy(update={"seed": 1})})
     with pytest.raises(InputError, match="other settings"):
-        design_hologram(target, printer, tmp_path, settings=other, announce=False)
+        design_hologram(tiny_target, printer, tmp_path, settings=other, announce=False)
     changed = np.load(tmp_path / "layout_level.npy") + 1
     np.save(tmp_path / "layout_level.npy", changed)
     with pytest.raises(InputError, match="changed after the design"):
@@ -339,14 +351,14 @@ def test_a_hologram_smaller_than_the_window_of_its_score_is_refused(small_settin
         )
 
 
-def test_a_place_that_holds_something_else_is_refused(tmp_path, small_settings, make_printer, target):
-    search = small_settings.search.model_copy(update={"iterations": 1, "polish_rounds": 0})
-    settings = small_settings.model_copy(update={"search": search})
+def test_a_place_that_holds_something_else_is_refused(tmp_path, tiny_settings, make_printer, tiny_target):
+    search = tiny_settings.search.model_copy(update={"iterations": 1, "polish_rounds": 0})
+    settings = tiny_settings.model_copy(update={"search": search})
     printer = make_printer(settings.layout)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="which is a file"):
-        design_hologram(target, printer, tmp_path / "file", settings=settings, announce=False)
-    design_hologram(target, printer, tmp_path / "design", settings=settings, announce=False)
+        design_hologram(tiny_target, printer, tmp_path / "file", settings=settings, announce=False)
+    design_hologram(tiny_target, printer, tmp_path / "design", settings=settings, announce=False)
     report = (tmp_path / "design" / "report.html").read_bytes()
     # Both write a report.html: the score would replace that of the design.
     with pytest.raises(InputError, match=r"which holds design\.json"):
@@ -354,6 +366,8 @@ def test_a_place_that_holds_something_else_is_refused(tmp_path, small_settings, 
     assert (tmp_path / "design" / "report.html").read_bytes() == report
     score_design(tmp_path / "design", tmp_path / "design" / "score", judges=[printer])
     with pytest.raises(InputError, match=r"which holds score\.json"):
-        design_hologram(target, printer, tmp_path / "design" / "score", settings=settings, announce=False)
+        design_hologram(
+            tiny_target, printer, tmp_path / "design" / "score", settings=settings, announce=False
+        )
     with pytest.raises(InputError, match="device"):
         score_design(tmp_path / "design", tmp_path / "other", judges=[], device="cuda:99")

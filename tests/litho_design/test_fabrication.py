@@ -97,7 +97,8 @@ def test_a_flagged_design_says_what_staying_inside_costs(tmp_path):
 
     def designed(name, **more):
         settings = hologram_settings(changes=changes | more)
-        return design_hologram("ring", "zoo:physics", tmp_path / name, settings=settings, announce=False)
+        alone = {"judges": (), "announce": False}
+        return design_hologram("ring", "zoo:physics", tmp_path / name, settings=settings, **alone)
 
     free = designed("free")
     gauge = free.out_of_distribution

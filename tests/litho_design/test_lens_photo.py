@@ -49,6 +49,7 @@ def lens(tmp_path_factory):
             "search": default.search.model_copy(update={"iterations": 3, "polish_rounds": 0}),
             "view": default.view.model_copy(update={"window_px": 128}),
             "imaging": default.imaging.model_copy(update={"object_px": OBJECT_PX}),
+            "window": default.window.model_copy(update={"yield_draws": 2}),
         }
     )
     folder = tmp_path_factory.mktemp("lens") / "design"

@@ -78,6 +78,7 @@ def printed_design(tmp_path_factory, small_settings, make_printer):
     return folder
 
 
+@pytest.mark.pictures
 def test_a_measured_print_scores_like_the_print_it_is(tmp_path, printed_design):
     loaded = LoadedDesign(printed_design)
     height = loaded.expected_um.numpy().astype(np.float64)
@@ -141,6 +142,7 @@ def test_a_scan_of_something_else_is_refused(tmp_path, printed_design):
         )
 
 
+@pytest.mark.pictures
 def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design):
     loaded = LoadedDesign(printed_design)
     image = loaded.image(loaded.expected_um)

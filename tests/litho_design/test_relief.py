@@ -172,7 +172,8 @@ def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_pr
 def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys):
     """A step of one pixel cannot be printed, and neither can more than the levels reach."""
     words = ["correct", "staircase", "--model", "zoo:physics", "--size-px", "48", "--iterations", "10"]
-    words += ["--set", "search.polish_rounds=0", "--height-um", "1.5", "--out", str(tmp_path / "out")]
+    words += ["--set", "search.polish_rounds=0", "--set", "window.yield_draws=2", "--height-um", "1.5"]
+    words += ["--judge", "none", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["litho-design", *words])
     with pytest.raises(SystemExit) as stop:
         main()

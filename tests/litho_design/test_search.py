@@ -24,7 +24,7 @@ def objective(level):
 def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
     """Runs of 1, 2 … iterations end where a longer one was after as many, whatever it says of itself."""
     told, shown = [], []
-    for iterations in range(1, 9):
+    for iterations in range(1, 6):
         # Soft samples to the end: a score of them would fall far below that of the printable layout.
         settings = SearchSettings(
             parametrisation=parametrisation, keep=keep, iterations=iterations, evaluate_every=1,

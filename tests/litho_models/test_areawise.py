@@ -149,16 +149,17 @@ def test_without_a_gradient_nothing_is_kept():
 
 def test_a_frozen_pbl_prints_what_the_trained_one_does(tmp_path):
     torch.manual_seed(0)
-    model = build_model("pbl", sigma_diffusion_init_um=0.2)
+    few = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep_um": (0.3,)}
+    model = build_model("pbl", sigma_diffusion_init_um=0.2, surroundings=few, scan_axis=few)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.03 * torch.randn_like(parameter))
-    layout = torch.randint(0, 13, (1, 1, 230, 240)) * 0.1
+    reach = model.reach_px
+    layout = torch.randint(0, 13, (1, 1, 2 * reach + 30, 2 * reach + 40)) * 0.1
     trained = model(layout)
     assert trained.grad_fn is not None
     frozen = load_frozen(save_frozen(model, tmp_path / "pbl"))
     assert torch.allclose(frozen(layout), trained.detach(), atol=1e-6)
-    reach = model.reach_px
     inside = frozen.inside(layout, reach)
-    assert inside.shape == (1, 1, 230 - 2 * reach, 240 - 2 * reach)
+    assert inside.shape == (1, 1, 30, 40)
     assert torch.allclose(inside, trained.detach()[..., reach:-reach, reach:-reach], atol=1e-6)

@@ -160,7 +160,7 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
 @pytest.mark.slow
 def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
     """On a network trained per fold the same fits have the same error in both, to the bit of a float."""
-    store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=80, bow_um=0.02)), tmp_path / "l"
+    store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=56, bow_um=0.02)), tmp_path / "l"
     scored = benchmark(store, tmp_path / "b", models=["features"], folds=2).scores[0]
     loop = close_loop(store, out, base="features", folds=2, cache=tmp_path / "b" / "cache")
     first = loop.error("base", "offset", "published")

@@ -5,18 +5,15 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
-import litho_data
 import litho_models
 from litho_data.foundation.errors import InputError
 from litho_models.cli.app import app
+from tests.litho_models.prints import make_scans, write_store
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("few")
-    card = litho_data.simulate(folder / "fab", count=4, size_px=128)
-    litho_data.build_dataset(card, folder / "few.zarr")
-    return folder / "few.zarr"
+    return write_store(tmp_path_factory.mktemp("few") / "few.zarr", make_scans(4, size_px=64))
 
 
 def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,8 +217,6 @@ def test_figures_do_not_depend_on_datum_tilt_and_bow_and_follow_the_height():
 
 
 def _with_height(scan, height_um):
-    from dataclasses import replace
-
     return replace(scan, height_um=height_um.astype(np.float32))
 
 
@@ -317,7 +316,8 @@ def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
 )
 def test_bad_input_is_one_line(lab, tmp_path, store, given, message):
     if store == "pitch":
-        write_store(lab / "pitch.zarr", make_scans(2, size_px=64), pitch_um=0.2, name="pitch")
+        coarse = [replace(scan, pitch_um=0.2) for scan in make_scans(2, size_px=64)]
+        write_store(lab / "pitch.zarr", coarse, name="pitch")
     for place, name in enumerate(("other", "other-too") if store == "other" else ()):
         flat = [
             _with_height(scan, 0.2 * scan.height_um)

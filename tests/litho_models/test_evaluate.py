@@ -48,7 +48,6 @@ def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path)
         evaluate(tmp_path / "empty", store, tmp_path / "out")
 
 
-@pytest.mark.pictures
 def test_the_example_with_a_metric_of_its_own_has_it_in_result_report_and_tables(trained, tmp_path):
     store, _, folder = trained
     example, out = Path(__file__).parents[2] / "examples" / "own_metric.py", tmp_path / "out"

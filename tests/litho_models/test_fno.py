@@ -209,7 +209,7 @@ def test_every_recipe_trains_every_variant(recipe, variant):
     settings = {**QUICK, "variant": variant, "learning_rate": 5e-3}
     settings |= {"crop_px": 48} if recipe == "paper" else {}
     config = TrainingConfig.of_recipe(recipe, "fno", **settings)
-    scans = make_scans(4, size_px=96)
+    scans = make_scans(4, size_px=64)
     fitted = fit_with_record("fno", scans, config, model_fields=fields)
     errors = [entry.training_mae_nm for entry in fitted.history]
     assert errors[-1] < errors[0]
@@ -237,7 +237,7 @@ def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
 
 
 def test_fno_learns_a_blur_beyond_its_start():
-    scans = make_scans(4, size_px=96, noise_um=0.002, datum_um=0.0)
+    scans = make_scans(4, size_px=64, noise_um=0.002, datum_um=0.0)
     config = TrainingConfig(**{**QUICK, "steps": 120, "learning_rate": 5e-3, "validation_scans": 0})
     fitted = fit_with_record("fno", scans, config, model_fields=SMALL)
     start = build_model("fno", **SMALL)

@@ -110,7 +110,10 @@ def test_a_cause_that_another_resembles_is_found(
     """On a Physics model, whose own blur, gain and saturation are fitted beside it."""
     base = build_model("physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4)
     effect = get_effect(name)
-    study = study_of(planted([(name, ALL, {"": effect.with_values(values)})], base=base, size_px=64))
+    scans = planted(
+        [(name, ALL, {"": effect.with_values(values)})], base=base, count=FEWEST_SCANS, size_px=64
+    )
+    study = study_of(scans)
     start = fit_state(Twin.bare(build_model("physics"), study.scans[0]), study)
     found = search(start, study, [effect, *map(get_effect, beside)])
     assert found.names == [name]

@@ -545,13 +545,14 @@ def store(tmp_path_factory):
     return write_store(tmp_path_factory.mktemp("noise") / "made.zarr", make_scans(8, size_px=128))
 
 
+@pytest.mark.pictures
 def test_a_store_without_references_has_the_floor_that_residuals_show(store, tmp_path):
     from litho_models.evaluation.benchmark import benchmark
     from litho_models.noise import NoiseAnalysis, analyse_noise
     from litho_models.scoring.noise_floor import stated_floor
 
     assert analyse_noise(store, tmp_path / "without").noise_floor.kind == "unknown"
-    scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=3)
+    scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=2)
     result = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "b"])
     assert NoiseAnalysis.read(tmp_path / "out") == result
     # Planted: 4 nm of white noise.
@@ -583,6 +584,7 @@ def test_a_store_of_ordinary_layouts_with_doses_has_no_matrix_and_says_so(tmp_pa
     assert any("No dose matrix: prints at dose 0.9, 1, 1.1" in note for note in result.notes)
 
 
+@pytest.mark.pictures
 def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
     from litho_models.noise import analyse_noise
 
@@ -664,7 +666,7 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
     from litho_models.noise.residuals import read_residuals
 
     # A bow of 30 nm in every scan, which a residual without the shared background would hold.
-    bowed = write_store(tmp_path / "bowed.zarr", make_scans(6, size_px=96, bow_um=0.03))
+    bowed = write_store(tmp_path / "bowed.zarr", make_scans(6, size_px=64, bow_um=0.03))
     scored = benchmark(bowed, tmp_path / "b", models=("linear",), folds=2, policy="offset-gain", seed=3)
     train(bowed, "linear", tmp_path / "run")
     model = tmp_path / "run" / "model"
@@ -682,6 +684,7 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
         assert mae_nm < 0.8 * scores.without_background[1].mae_nm
 
 
+@pytest.mark.pictures
 def test_the_command_takes_single_files(tmp_path):
     from typer.testing import CliRunner
 

@@ -34,7 +34,7 @@ def test_the_example_finds_the_effects_that_it_registers(
     catalogues: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     random, scans = np.random.default_rng(11), []
-    for scan in planted(count=12, size_px=64):
+    for scan in planted(count=10):
         x = np.linspace(-1, 1, scan.shape[1])[None, :]
         added = 0.03 * random.normal() * x**3 - 0.04 * np.exp(-scan.layout_um / own_effect.SINKING_DEPTH_UM)
         scans.append(replace(scan, height_um=(scan.height_um + added).astype(np.float32)))

@@ -29,8 +29,10 @@ from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_he
 
 pytestmark = pytest.mark.numerics
 
-QUICK = {"steps": 12, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
-SMALL_NETS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4), "sigma_diffusion_init_um": 0.3}
+QUICK = {"steps": 6, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
+CHANNELS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4)}
+FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.2,), "shifts_um": (0.2,), "steep_um": (0.4,)}
+SMALL_NETS = {**CHANNELS, "sigma_diffusion_init_um": 0.3, "surroundings": FEW, "scan_axis": FEW}
 
 
 def error_nm(model, scan) -> float:
@@ -160,7 +162,7 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
 
     def save_and_die(self, state):
         save(self, state)
-        if state.step == 8:
+        if state.step == 4:
             raise Killed
 
     monkeypatch.setattr(CheckpointFolder, "save", save_and_die)
@@ -196,7 +198,7 @@ ANOTHER_RUN = {
     "another seed": lambda scans: ("pbl", scans, {"seed": 5}, SMALL_NETS),
     "more steps": lambda scans: ("pbl", scans, {"steps": 24}, SMALL_NETS),
     "other nuisances": lambda scans: ("pbl", scans, {"nuisance": "full"}, SMALL_NETS),
-    "another variant": lambda scans: ("pbl", scans, {"variant": "paper"}, SMALL_NETS),
+    "another variant": lambda scans: ("pbl", scans, {"variant": "paper"}, CHANNELS),
     "other layers": lambda scans: ("pbl", scans, {}, {**SMALL_NETS, "areawise_channels": (8, 8)}),
     "another start": lambda scans: ("pbl", scans, {}, {**SMALL_NETS, "sigma_diffusion_init_um": 0.4}),
     "a scan less": lambda scans: ("pbl", scans[1:], {}, SMALL_NETS),
@@ -302,6 +304,9 @@ def test_precision_is_that_of_the_network_and_never_of_its_layout(crops, precisi
 @pytest.mark.parametrize("name", ["physics", "pbl", "fno"])
 def test_reduced_precision_trains_as_full_precision_does(name, variant):
     scans = make_scans(2, size_px=64)
+    fields = {"pbl": CHANNELS, "fno": {"width": 8, "modes": (4, 4)}}.get(name, {})
+    if (name, variant) == ("fno", "default"):
+        fields = fields | {"tile_px": 32, "overlap_px": 8}
     errors = []
     for precision in ("bf16-mixed", "32-true"):
         config = TrainingConfig.of_recipe(
@@ -314,7 +319,8 @@ def test_reduced_precision_trains_as_full_precision_does(name, variant):
             precision=precision,
             validation_scans=0,
         )
-        errors.append([entry.training_mae_nm for entry in fit_with_record(name, scans, config).history])
+        fitted = fit_with_record(name, scans, config, model_fields=fields)
+        errors.append([entry.training_mae_nm for entry in fitted.history])
     reduced, full = errors
     # 8 bits of significance in the features, averaged over thousands of pixels.
     assert reduced == pytest.approx(full, rel=0.02)
