@@ -2,7 +2,6 @@
 
 import csv
 import json
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,20 +54,25 @@ def write_card(
         "level_height_um": float(level_height_um),
         "levels": levels,
     }
+    card: dict[str, Any] = {"name": name, "title": title, "layout": layout, "scan": scan, **tables}
+    card = {key: _stated(value) if isinstance(value, Mapping) else value for key, value in card.items()}
+    check_card(card, "card to write")
     text = _toml({"name": name, "title": title})
-    all_tables: dict[str, Mapping[str, Any]] = {"layout": layout, "scan": scan, **tables}
-    for key, table in all_tables.items():
-        text += f"\n[{key}]\n{_toml(table)}"
-    check_card(tomllib.loads(text), "card to write")
+    for key, table in card.items():
+        if isinstance(table, Mapping):
+            text += f"\n[{key}]\n{_toml(table)}"
     path = folder / CARD_NAME
     path.write_text(text, encoding="utf-8")
     return path
 
 
+def _stated(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in table.items() if value is not None}
+
+
 def _toml(table: Mapping[str, Any]) -> str:
     # Strings, numbers, truth and lists of them are written alike in JSON and in TOML.
-    said = {key: value for key, value in table.items() if value is not None}
-    return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in said.items())
+    return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in table.items())
 
 
 def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
