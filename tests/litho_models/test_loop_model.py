@@ -214,7 +214,7 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
     twin = Twin.bare(base, study.scans[0])
     assert len(twin.vector) == twin.own == 0
     state = fit_state(twin, study)
-    assert state.per_fold.shape == (5, 0)
+    assert state.per_fold.shape == (3, 0)
     assert state.mse_nm2 > 16
 
 
