@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
-from litho_models.effects import get_effect
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import ScanFinding
@@ -123,15 +121,14 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
-    effect = get_effect("registration-residual")
-
     def bent(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
         # 0.1 µm at the rim against the middle, freed of its mean; one sign for all, or one for each.
         size_um = 0.1 if shared else 0.1 * SIGNS[scan.stored.order]
-        values = {name: torch.zeros(()) for name in effect.parameters}
-        values |= {"x_by_xx_um": torch.tensor(size_um), "shift_x_um": torch.tensor(-size_um / 3)}
-        height = torch.from_numpy(scan.stored.height_um)[None, None]
-        return effect.apply(height, values, scan.context)[0, 0].numpy() - scan.stored.height_um
+        height = np.asarray(scan.stored.height_um, np.float64)
+        rows, columns = np.indices(height.shape, dtype=float)
+        across = np.linspace(-1, 1, height.shape[1])
+        moved = columns + size_um * (across**2 - 1 / 3) / scan.stored.pitch_um
+        return map_coordinates(height, [rows, moved], order=3, mode="nearest") - height
 
     found = found_with(bent, SMALL_PX, shared_known=shared)["registration-residual"]
     assert found.seen is not shared
