@@ -116,12 +116,18 @@ def test_a_metadata_document_that_zarr_cannot_read_is_named(
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("pitch_um", 0.2), ("levels", 14), ("license", "none"), ("dataset_sha256", "0" * 64), ("more", 1)],
+    [("levels", 14), ("license", "none"), ("dataset_sha256", "0" * 64), ("more", 1)],
 )
 def test_a_changed_attribute_is_named(own_campaign: Path, key: str, value: object) -> None:
     root = zarr.open_group(own_campaign / "prints.zarr", mode="a", use_consolidated=False)
     root.attrs[key] = value
     assert f"attribute {key}" in named(own_campaign)
+
+
+def test_a_changed_pitch_contradicts_the_coordinates(own_campaign: Path) -> None:
+    root = zarr.open_group(own_campaign / "prints.zarr", mode="a", use_consolidated=False)
+    root.attrs["pitch_um"] = 0.2
+    assert "got 0.05, 0.15, 0.25, …, wanted 0.1, 0.3, 0.5" in named(own_campaign)
 
 
 def test_a_changed_parameter_of_a_step_is_named(own_campaign: Path) -> None:
