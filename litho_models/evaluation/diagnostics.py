@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from litho_models.prediction.cost import PredictionCost, measured_predictions
 from litho_models.prediction.tiles import predict_scan, tile_difference
 from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
-from litho_models.scoring.metrics import score_scan
+from litho_models.scoring.metrics import mean_error_nm
 from litho_models.simulator import Simulator
 
 
@@ -58,15 +58,17 @@ def diagnose(
         measured: also learn the measurement model beside it.
     """
     heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
-    seen = {scan.id: height for scan, height in zip(scans, heights, strict=True)}
-    unseen = {scan.id: height for scan, height in zip(held_out, held_out_um, strict=True)}
-    chosen_by = [scan for scan in scans if scan.id in validation_ids]
+
+    def error_nm(chose: bool) -> float:
+        own = [one for one in zip(scans, heights, strict=True) if (one[0].id in validation_ids) == chose]
+        return mean_error_nm([scan for scan, _ in own], [height for _, height in own])
+
     return FitDiagnostics(
         background=learn_background(scans, heights),
         measurement=learn_measurement(scans, heights) if measured else None,
-        training_nm=_error_nm([scan for scan in scans if scan.id not in validation_ids], seen),
-        inner_validation_nm=_error_nm(chosen_by, seen) if chosen_by else None,
-        held_out_nm=_error_nm(held_out, unseen),
+        training_nm=error_nm(False),
+        inner_validation_nm=error_nm(True) if validation_ids else None,
+        held_out_nm=mean_error_nm(held_out, held_out_um),
         tiles=tile_consistency(model, held_out[0]),
         cost=cost,
     )
@@ -91,8 +93,3 @@ def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileConsisten
 def device_of(model: torch.nn.Module) -> str:
     """Where a model's weights are, as torch names it."""
     return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
-
-
-def _error_nm(scans: Sequence[PrintedScan], heights_um: Mapping[str, np.ndarray]) -> float:
-    scores = [score_scan(scan.id, scan.height_um, heights_um[scan.id], scan.valid) for scan in scans]
-    return float(np.mean([score.mae_datum_free_nm for score in scores]))

@@ -69,15 +69,15 @@ class MetricValues(Record):
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-class ScanRow(MetricValues):
-    """The scores of one scan.
+class ScanErrors(Record):
+    """Error of one model on one scan over the scored pixels.
 
-    Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
-    correlation of the two (``print_gain``); None where they cannot be known.
+    ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are freed of
+    terms fitted on other pixels. Slope and intercept, the gain and offset of the print against the
+    prediction, have standard errors and a correlation (``print_gain``); None where they cannot be known.
     """
 
-    scan: str
-    print: str
+    pixels: int
     mae_abs_nm: float
     bias_nm: float
     mae_datum_free_nm: float
@@ -89,7 +89,13 @@ class ScanRow(MetricValues):
     slope_error: float | None = None
     intercept_error_nm: float | None = None
     slope_intercept_correlation: float | None = None
-    pixels: int
+
+
+class ScanRow(MetricValues, ScanErrors):
+    """The scores of one scan."""
+
+    scan: str
+    print: str
 
     @property
     def line_covariance(self) -> np.ndarray | None:
