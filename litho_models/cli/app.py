@@ -13,9 +13,7 @@ from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_ap
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import assigned
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.cli.check import check
-from litho_models.cli.loop import close_loop
-from litho_models.cli.next_print import next_print
+from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")

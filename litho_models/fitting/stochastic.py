@@ -30,7 +30,7 @@ from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
 from litho_models.fitting.pixel_weights import Weights, pixel_weights
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
-from litho_models.scan_terms.training import estimate_scan_terms, training_terms
+from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
 from litho_models.scoring.metrics import mean_error_nm
 from litho_models.simulator import Simulator
 

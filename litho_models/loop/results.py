@@ -29,8 +29,8 @@ from litho_models.loop.record import (
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
-from litho_models.scan_terms.groups import ALL
-from litho_models.scoring.pairs import over_prints, over_scans
+from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.records import over_prints, over_scans
 from litho_models.simulator import Simulator
 
 _BASE_ABSORBS = 1e-2

@@ -14,9 +14,8 @@ from litho_models.monitoring.change_point import (
     likeliest_step,
     noticeable_step,
 )
-from litho_models.monitoring.prints import FIGURES, Figure, print_values, spread_of
-from litho_models.monitoring.result import Alarm, FigureCheck
-from litho_models.scoring.scan_figures import ScanFigures
+from litho_models.monitoring.prints import FIGURES, Alarm, Figure, FigureCheck, print_values, spread_of
+from litho_models.scoring.metrics import ScanFigures
 
 
 class Trend(NamedTuple):

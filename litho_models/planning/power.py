@@ -21,8 +21,7 @@ from scipy.stats import norm
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.judging import CONFIRM_P
-from litho_models.planning.noise import NoiseSpectrum
-from litho_models.planning.questions import Question
+from litho_models.planning.questions import NoiseSpectrum, Question
 from litho_models.planning.rivalry import Contrast
 
 # A wrong name is given with this probability at most.

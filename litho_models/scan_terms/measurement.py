@@ -24,8 +24,7 @@ from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
 from litho_models.scan_terms.background import field_um, is_of_size
 from litho_models.scan_terms.cross_fit import least_squares
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, groupings, label_of
+from litho_models.scan_terms.grouped import ALL, Block, Products, groupings, label_of
 from litho_models.scan_terms.term import FloatMap
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]

@@ -1,17 +1,20 @@
-"""What is scored and what comes out: the protocol, a prediction, and the scores of a scan and of a model."""
+"""What is scored and what comes out: a prediction, the scores of a scan and of a model, scores in pairs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL, paired_difference, smallest_flip_p
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
@@ -132,3 +135,81 @@ class ModelScores(MetricValues):
     scan_line_offset_sd_nm: float
     dropped_pixels: int
     constant_predictions: int
+
+
+class OverUnits(Record):
+    """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
+
+    ``count``: of these; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
+    interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, which with so many
+    cannot go below ``smallest_p``.
+    """
+
+    count: int
+    positive: int
+    ci95_nm: tuple[float, float] | None
+    p: float
+    smallest_p: float
+
+
+def over_scans(differences_nm: Sequence[float], seed: int = 0) -> OverUnits:
+    """A difference per scan, resampled over scans."""
+    return _over_units(differences_nm, None, seed)
+
+
+def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
+    """A difference per scan, resampled over the ``prints`` of the scans; None for a single print."""
+    return _over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
+
+
+def _over_units(differences_nm: Sequence[float], groups: Sequence[str] | None, seed: int) -> OverUnits:
+    differences = list(differences_nm)
+    found = paired_difference(differences, [0.0] * len(differences), groups=groups, seed=seed)
+    return OverUnits(
+        count=found.units,
+        positive=found.second_better,
+        ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
+        p=found.p,
+        smallest_p=smallest_flip_p(found.units),
+    )
+
+
+class Paired(Record):
+    """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better.
+
+    ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
+    """
+
+    first: str
+    second: str
+    mean_nm: float
+    ci95_nm: tuple[float, float] | None
+    p: float
+    first_better: int
+    scans: int
+    over_prints: OverUnits | None = None
+
+
+def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
+    """Compare the datum-free errors of the same scans, which meet by id: results list them by fold.
+
+    Raises:
+        InputError: scores of different scans.
+    """
+    errors = [{row.scan: row.mae_datum_free_nm for row in score.scans} for score in (first, second)]
+    if errors[0].keys() != errors[1].keys():
+        counts = " and ".join(str(len(found)) for found in errors)
+        raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
+    pairs = list(errors[0].values()), [errors[1][scan] for scan in errors[0]]
+    found = paired_difference(*pairs, seed=seed)
+    differences = [a - b for a, b in zip(*pairs, strict=True)]
+    return Paired(
+        first=first.model,
+        second=second.model,
+        mean_nm=found.mean,
+        ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
+        p=found.p,
+        first_better=found.first_better,
+        scans=found.units,
+        over_prints=over_prints(differences, [row.print for row in first.scans], seed),
+    )

@@ -12,9 +12,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_models import load_frozen, save_frozen
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.fit_cache import fit_or_load
+from litho_models.evaluation.results import compare
 from litho_models.fitting import TrainingConfig
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard

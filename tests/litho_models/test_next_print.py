@@ -42,16 +42,24 @@ from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
 from litho_models.planning.deciding import MICROSCOPE, NONE, PRINTER, Judge, compared, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
-from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question
 from litho_models.planning.power import Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals
+from litho_models.planning.questions import (
+    NoiseSpectrum,
+    OpenQuestions,
+    Owner,
+    Question,
+    Rival,
+    fit_rivals,
+    left_nm,
+    noise_spectrum,
+)
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
 from tests.litho_models.prints import write_store
