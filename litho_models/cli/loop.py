@@ -1,4 +1,4 @@
-"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, what would tell, is it still right?"""
+"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, what would tell, is it still so?"""
 
 from __future__ import annotations
 
