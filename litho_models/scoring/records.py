@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from litho_data.store import PrintedScan
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
-from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL, paired_difference, smallest_flip_p
+from litho_models.scoring.statistics import OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
@@ -137,43 +136,6 @@ class ModelScores(MetricValues):
     constant_predictions: int
 
 
-class OverUnits(Record):
-    """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
-
-    ``count``: of these; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
-    interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, which with so many
-    cannot go below ``smallest_p``.
-    """
-
-    count: int
-    positive: int
-    ci95_nm: tuple[float, float] | None
-    p: float
-    smallest_p: float
-
-
-def over_scans(differences_nm: Sequence[float], seed: int = 0) -> OverUnits:
-    """A difference per scan, resampled over scans."""
-    return _over_units(differences_nm, None, seed)
-
-
-def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
-    """A difference per scan, resampled over the ``prints`` of the scans; None for a single print."""
-    return _over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
-
-
-def _over_units(differences_nm: Sequence[float], groups: Sequence[str] | None, seed: int) -> OverUnits:
-    differences = list(differences_nm)
-    found = paired_difference(differences, [0.0] * len(differences), groups=groups, seed=seed)
-    return OverUnits(
-        count=found.units,
-        positive=found.second_better,
-        ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
-        p=found.p,
-        smallest_p=smallest_flip_p(found.units),
-    )
-
-
 class Paired(Record):
     """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better.
 
@@ -200,16 +162,15 @@ def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Pai
     if errors[0].keys() != errors[1].keys():
         counts = " and ".join(str(len(found)) for found in errors)
         raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
-    pairs = list(errors[0].values()), [errors[1][scan] for scan in errors[0]]
-    found = paired_difference(*pairs, seed=seed)
-    differences = [a - b for a, b in zip(*pairs, strict=True)]
+    differences = [one - errors[1][scan] for scan, one in errors[0].items()]
+    found = over_units(differences, seed=seed)
     return Paired(
         first=first.model,
         second=second.model,
-        mean_nm=found.mean,
-        ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
+        mean_nm=float(np.mean(differences)),
+        ci95_nm=found.ci95_nm,
         p=found.p,
-        first_better=found.first_better,
-        scans=found.units,
+        first_better=sum(one < 0 for one in differences),
+        scans=found.count,
         over_prints=over_prints(differences, [row.print for row in first.scans], seed),
     )
