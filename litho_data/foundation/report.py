@@ -228,6 +228,16 @@ def _template() -> jinja2.Template:
     return environment.from_string(text)
 
 
+def filled(template: Path, **values: object) -> str:
+    """A page of text from its template (Jinja) and the values that the template names."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(template.read_text(encoding="utf-8")).render(values)
+
+
 def _whole_options(text: str) -> Markup:
     """Options of commands in a sentence do not break over two lines."""
     from markupsafe import Markup, escape
