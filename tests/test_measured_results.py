@@ -11,7 +11,7 @@ import pytest
 from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
 from benchmarks.record import published
 from litho_models.evaluation.results import Benchmark
-from litho_models.noise.analyse import NoiseAnalysis
+from litho_models.noise.result import NoiseAnalysis
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)

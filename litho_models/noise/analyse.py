@@ -1,23 +1,18 @@
-"""``litho-models noise``, ``noise.json``: what no model can predict, estimated from whatever was measured."""
+"""``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
 
-from pydantic import Field, JsonValue
-
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.results import Result
-from litho_data.foundation.run_facts import RunInfo, run_info
+from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
-from litho_data.store.schema import DatasetId
 from litho_models.noise.budget import NoiseBudget, noise_budget
-from litho_models.noise.calibration import SpreadAnalysis, analyse_spread
-from litho_models.noise.dose import DoseMatrix, dose_matrix
+from litho_models.noise.calibration import analyse_spread
+from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import (
     Reference,
     ReferencePrints,
@@ -28,51 +23,7 @@ from litho_models.noise.references import (
 )
 from litho_models.noise.report import write_noise_report
 from litho_models.noise.residuals import read_residuals
-from litho_models.noise.surface import pooled
-from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
-
-
-class NoiseAnalysis(Result):
-    """``noise.json``; ``bounds`` are found in older files, which had them in place of a budget."""
-
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = "noise.json"
-
-    run: RunInfo
-    dataset: DatasetId | None
-    noise_floor: NoiseFloor
-    references: ReferencePrints
-    repeats: RepeatedPrints | None = None
-    dose: DoseMatrix | None
-    budget: NoiseBudget | None = None
-    bounds: list[dict[str, JsonValue]] = Field(default_factory=list)
-    spread: SpreadAnalysis | None
-    notes: list[str]
-
-
-def floor_of(
-    found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
-) -> NoiseFloor:
-    """The floor: of repeats, else of a flat print, else what the residuals of a model say."""
-    if repeats is not None:
-        return NoiseFloor(
-            mae_nm=repeats.mae_nm,
-            rmse_nm=repeats.sigma_nm,
-            kind="measured",
-            source=f"half the variance between {repeats.scans} repeated prints, offset and bow of a pair "
-            "removed",
-        )
-    flats = [flat for flat in found.flats if flat.background == "offset"]
-    if flats:
-        flat = pooled(flats)
-        return NoiseFloor(
-            mae_nm=flat.mae_nm,
-            rmse_nm=flat.sigma_nm,
-            kind="measured",
-            source=f"flat print ({', '.join(one.id for one in flats)}), offset removed, MAE as measured; one "
-            "level only: edges and other levels may be rougher",
-        )
-    return budget.floor if budget is not None else UNKNOWN_FLOOR
+from litho_models.noise.result import NoiseAnalysis, floor_of
 
 
 def analyse_noise(
@@ -100,37 +51,39 @@ def analyse_noise(
     if model is not None and not residuals:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
-    require_own_folder(out, NoiseAnalysis.FILE_NAME, subject={"dataset.name": dataset.name})
-    every = dataset.scans()
-    locked = dataset.locked_ids
-    scans = [scan for scan in every if scan.id not in locked]
-    references = store_references(dataset)
-    spread = read_residuals(dataset, residuals, model) if residuals else None
-    found = reference_prints(references, dataset.level_height_um)
-    dose, notes = dose_matrix(every)
-    # A dose often has one print, without which it is lost, and no model is judged by the matrix.
-    in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
-    if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
-        notes.append(f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}.")
-    dropped = [
-        f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
-        for scan_id in locked
-    ]
-    repeats = repeated_prints(scans)
-    budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
-    result = NoiseAnalysis(
-        run=run_info([seed], len(scans), dropped),
-        dataset=dataset.dataset_id,
-        noise_floor=floor_of(found, repeats, budget),
-        references=found,
-        repeats=repeats,
-        dose=dose,
-        budget=budget,
-        spread=analyse_spread(spread, seed) if spread is not None else None,
-        notes=[*_notes(found, repeats, budget), *notes],
-    )
-    result.write(out)
-    write_noise_report(result, references, out)
+    with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
+        every = dataset.scans()
+        locked = dataset.locked_ids
+        scans = [scan for scan in every if scan.id not in locked]
+        references = store_references(dataset)
+        spread = read_residuals(dataset, residuals, model) if residuals else None
+        found = reference_prints(references, dataset.level_height_um)
+        dose, notes = dose_matrix(every)
+        # A dose often has one print, without which it is lost, and no model is judged by the matrix.
+        in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
+        if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
+            notes.append(
+                f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}."
+            )
+        dropped = [
+            f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
+            for scan_id in locked
+        ]
+        repeats = repeated_prints(scans)
+        budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
+        result = NoiseAnalysis(
+            run=run_info([seed], len(scans), dropped),
+            dataset=dataset.dataset_id,
+            noise_floor=floor_of(found, repeats, budget),
+            references=found,
+            repeats=repeats,
+            dose=dose,
+            budget=budget,
+            spread=analyse_spread(spread, seed) if spread is not None else None,
+            notes=[*_notes(found, repeats, budget), *notes],
+        )
+        write_noise_report(result, references, out)
+        result.write(out)
     return result
 
 
@@ -155,24 +108,26 @@ def analyse_noise_of_files(
     Raises:
         InputError: a file that cannot be read, or without a known pitch.
     """
-    require_own_folder(out, NoiseAnalysis.FILE_NAME)
-    references = []
-    for use, file in (("substrate", substrate), ("flat", flat), ("steps", steps)):
-        if file is not None:
-            scan = read_scan(file, unit=unit, size_um=size_um)
-            references.append(Reference(Path(file).stem, use, scan.height_um, scan.require_pitch()))
-    found = reference_prints(references, level_height_um)
-    result = NoiseAnalysis(
-        run=run_info([], len(references)),
-        dataset=None,
-        noise_floor=floor_of(found, None, None),
-        references=found,
-        dose=None,
-        spread=None,
-        notes=["Single scans as read: levelling is an offset or a polynomial of second degree, as stated."],
-    )
-    result.write(out)
-    write_noise_report(result, references, out)
+    with growing_folder(out, NoiseAnalysis.FILE_NAME):
+        references = []
+        for use, file in (("substrate", substrate), ("flat", flat), ("steps", steps)):
+            if file is not None:
+                scan = read_scan(file, unit=unit, size_um=size_um)
+                references.append(Reference(Path(file).stem, use, scan.height_um, scan.require_pitch()))
+        found = reference_prints(references, level_height_um)
+        result = NoiseAnalysis(
+            run=run_info([], len(references)),
+            dataset=None,
+            noise_floor=floor_of(found, None, None),
+            references=found,
+            dose=None,
+            spread=None,
+            notes=[
+                "Single scans as read: levelling is an offset or a polynomial of second degree, as stated."
+            ],
+        )
+        write_noise_report(result, references, out)
+        result.write(out)
     return result
 
 

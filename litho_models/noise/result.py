@@ -1,0 +1,60 @@
+"""``noise.json``: everything known about the noise of a dataset, and the floor that follows."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field, JsonValue
+
+from litho_data.foundation.results import Result
+from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
+from litho_models.noise.budget import NoiseBudget
+from litho_models.noise.calibration import SpreadAnalysis
+from litho_models.noise.dose import DoseMatrix
+from litho_models.noise.references import ReferencePrints, RepeatedPrints
+from litho_models.noise.surface import pooled
+from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
+
+
+class NoiseAnalysis(Result):
+    """``noise.json``; ``bounds`` are found in older files, which had them in place of a budget."""
+
+    SCHEMA: ClassVar[str] = "litho-models/noise/1"
+    FILE_NAME: ClassVar[str] = "noise.json"
+
+    run: RunInfo
+    dataset: DatasetId | None
+    noise_floor: NoiseFloor
+    references: ReferencePrints
+    repeats: RepeatedPrints | None = None
+    dose: DoseMatrix | None
+    budget: NoiseBudget | None = None
+    bounds: list[dict[str, JsonValue]] = Field(default_factory=list)
+    spread: SpreadAnalysis | None
+    notes: list[str]
+
+
+def floor_of(
+    found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
+) -> NoiseFloor:
+    """The floor: of repeats, else of a flat print, else what the residuals of a model say."""
+    if repeats is not None:
+        return NoiseFloor(
+            mae_nm=repeats.mae_nm,
+            rmse_nm=repeats.sigma_nm,
+            kind="measured",
+            source=f"half the variance between {repeats.scans} repeated prints, offset and bow of a pair "
+            "removed",
+        )
+    flats = [flat for flat in found.flats if flat.background == "offset"]
+    if flats:
+        flat = pooled(flats)
+        return NoiseFloor(
+            mae_nm=flat.mae_nm,
+            rmse_nm=flat.sigma_nm,
+            kind="measured",
+            source=f"flat print ({', '.join(one.id for one in flats)}), offset removed, MAE as measured; one "
+            "level only: edges and other levels may be rougher",
+        )
+    return budget.floor if budget is not None else UNKNOWN_FLOOR
