@@ -1,4 +1,4 @@
-"""The closed surface of columns of whole levels: two triangles a top, and walls that meet corner to corner."""
+"""The closed surface of columns of whole levels: two triangles a top; walls meet corner to corner."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 # Where columns touch along an edge only, the higher one keeps this share of a cell away from it.
 _APART = 1 / 128
-# Cells around a point, and the way (x, y) from the point to them: south-west, south-east, north-west, north-east.
+# Ways (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
 _WAY = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)], np.float32)
 _BELOW = -1
 
@@ -14,8 +14,8 @@ _BELOW = -1
 def step_solid(levels: np.ndarray) -> np.ndarray:
     """Triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
 
-    Every edge has two faces, which meet it in opposite directions: a wall has a corner wherever one of the four
-    columns around its ends has its top.
+    Every edge has two faces, which meet it in opposite directions: a wall has a corner wherever one of the
+    four columns around its ends has its top.
 
     Args:
         levels: integers (ny, nx) of 0 or more; y grows with the row.
