@@ -229,12 +229,6 @@ def test_seams_are_bare_where_fields_part_and_no_taller_where_they_overlap():
     moved.sum().backward()
     assert plate.grad[7, :4].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
     assert plate.grad[7, 36:44].tolist() == pytest.approx([0.5] * 8)
-    # A part of the rows gives what the whole does, but for the largest offset and a row at its ends.
-    offsets_um = Stitching(field_um=2.0, sigma_um=0.1).offsets_um(60, 0.1, [1])
-    print_um = torch.rand(60, 60, generator=torch.Generator().manual_seed(0))
-    whole, reach = in_fields(print_um, 0.1, 20, offsets_um), int(np.abs(offsets_um).max() / 0.1) + 2
-    part = in_fields(print_um[11:51], 0.1, 20, offsets_um, 11)
-    assert torch.equal(part[reach:-reach], whole[11 + reach : 51 - reach])
 
 
 def test_displaced_fields_lose_of_an_order_what_their_spread_says_and_other_draws_stay():
