@@ -147,7 +147,6 @@ class ScanFiles(Record):
     """
 
     files: FilePatterns
-    instrument: Instrument = "afm"
     format: KnownFormat = "auto"
     unit: KnownUnit | None = None
     size_um: tuple[Length, Length] | None = None
@@ -156,6 +155,7 @@ class ScanFiles(Record):
     full_scale_file: InsidePath | None = None
     levelled: bool = False
     missing: tuple[Annotated[float, Field(strict=True)] | str, ...] | None = None
+    instrument: Instrument = "afm"
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
