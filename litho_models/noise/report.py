@@ -17,8 +17,8 @@ from litho_models.noise.texture import Texture
 from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:
-    from litho_models.noise.result import NoiseAnalysis
     from litho_models.noise.references import Reference
+    from litho_models.noise.result import NoiseAnalysis
 
 # What each policy fits to a scan first, in words.
 _FREE = {
