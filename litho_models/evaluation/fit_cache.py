@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
@@ -109,14 +109,13 @@ def device_of(model: torch.nn.Module) -> str:
     return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
 
 
-_FIT, _DIAGNOSTICS, _PREDICTION = "fit.json", "diagnostics.json", "prediction_{:03d}.npy"
+_FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(Record):
     """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
 
-    ``at_bounds`` are fitted values on a bound of their range, and that bound. ``diagnostics`` are None in
-    older result files.
+    ``at_bounds`` are fitted values on a bound of their range, and that bound.
     """
 
     model: str
@@ -131,7 +130,7 @@ class FitRecord(Record):
     training_mae_nm: list[float]
     validation_mae_datum_free_nm: list[float | None]
     at_bounds: dict[str, float] = Field(default_factory=dict)
-    diagnostics: FitDiagnostics | None = None
+    diagnostics: FitDiagnostics
 
 
 def fit_or_load(
@@ -150,21 +149,13 @@ def fit_or_load(
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
     key = record_sha256({"fit": key, "background": "shared"}) if measured else key
     folder = fit_folder(cache, name, key)
-    if not ((folder / _FIT).exists() and (folder / _DIAGNOSTICS).exists()):
+    if not (folder / _FIT).exists():
         # A finished training is read from its checkpoint; a small model is fitted again.
         fitted = fit_in_cache(name, fold.training, config, cache)
         if measured:
             fitted = fit_in_cache(name, _freed(fitted.model, fold.training), config, cache)
-        if not (folder / _FIT).exists():
-            _keep_fit(folder, fitted, fold, key)
-        _, heights = kept_fit(folder)
-        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured)
-        with atomic_file(folder / _DIAGNOSTICS) as temporary:
-            temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
-    record, heights = kept_fit(folder)
-    with reading_kept(folder):
-        diagnostics = FitDiagnostics.model_validate_json((folder / _DIAGNOSTICS).read_bytes())
-    return record.model_copy(update={"diagnostics": diagnostics}), heights
+        _keep_fit(folder, fitted, fold, key, measured)
+    return kept_fit(folder)
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
@@ -179,7 +170,7 @@ def expected(
 ) -> Prediction:
     """What a fit expects of a scan: its height (ny, nx), µm, and what its training scans add to theirs."""
     found = record.diagnostics
-    if background == "none" or found is None:
+    if background == "none":
         return Prediction(height_um)
     if background == "shared" and found.measurement is not None:
         return Prediction.seen(found.measurement, scan, height_um)
@@ -192,7 +183,7 @@ def fit_folder(cache: Path, name: str, key: str) -> Path:
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """The record of a fit and its heights (ny, nx) of ``held_out_ids``, µm; without diagnostics.
+    """The record of a fit and its heights (ny, nx) of ``held_out_ids``, µm.
 
     Raises:
         InputError: files that are missing or damaged.
@@ -203,7 +194,8 @@ def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
         return record, [np.load(file, allow_pickle=False) for file in files]
 
 
-def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
+def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool) -> None:
+    heights = [predict_scan(fitted.model, scan) for scan in fold.held_out]
     record = FitRecord(
         model=fitted.model.name,
         fold=fold.number,
@@ -217,8 +209,11 @@ def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
         at_bounds=fitted.model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
+        diagnostics=diagnose(
+            fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured
+        ),
     )
     with atomic_folder(folder) as temporary:
-        for number, scan in enumerate(fold.held_out):
-            np.save(temporary / _PREDICTION.format(number), predict_scan(fitted.model, scan))
+        for number, height in enumerate(heights):
+            np.save(temporary / _PREDICTION.format(number), height)
         (temporary / _FIT).write_text(record.model_dump_json(indent=1), encoding="utf-8")
