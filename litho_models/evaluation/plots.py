@@ -30,23 +30,18 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
     axes = figure.subplots()
     position = np.arange(len(scores))
     colours = [model_colour(s.model) for s in scores]
-    for shift, label, strength, values in (
-        (-0.17, "nothing fitted", 0.4, [(s.mae_abs_nm, s.mae_abs_ci95_nm) for s in scores]),
-        (
-            0.17,
-            "own terms of each scan fitted",
-            1.0,
-            [(s.mae_datum_free_nm, s.mae_datum_free_ci95_nm) for s in scores],
-        ),
+    for shift, label, strength, error in (
+        (-0.17, "nothing fitted", 0.4, "mae_abs"),
+        (0.17, "own terms of each scan fitted", 1.0, "mae_datum_free"),
     ):
-        means = np.array([mean for mean, _ in values])
+        means = np.array([getattr(s, f"{error}_nm") for s in scores])
         axes.barh(position + shift, means, 0.32, color=colours, alpha=strength)
         axes.fill_between([], [], color="#868d98", alpha=strength, label=label)
-        ends = np.array([ci or (mean, mean) for mean, ci in values])
+        ends = [getattr(s, f"{error}_ci95_nm") or (mean, mean) for s, mean in zip(scores, means, strict=True)]
         axes.errorbar(
             means,
             position + shift,
-            xerr=np.abs(ends.T - means),
+            xerr=np.abs(np.transpose(ends) - means),
             fmt="none",
             ecolor=LIGHT["ink"],
             capsize=3,
@@ -188,19 +183,16 @@ def print_gains(score: ModelScores) -> Figure:
     prints = sorted({row.print for row in score.scans})
     for number, name in enumerate(prints):
         colour = f"C{number % 10}"
-        placed = [
-            (row.slope, row.intercept_nm, row.line_covariance)
-            for row in score.scans
-            if row.print == name and row.slope is not None
-        ]
-        axes.plot([gain for gain, _, _ in placed], [at for _, at, _ in placed], ".", color=colour, label=name)
-        for gain, offset_nm, covariance in placed:
-            if covariance is None:
+        rows = [row for row in score.scans if row.print == name and row.slope is not None]
+        placed = [(row.slope, row.intercept_nm) for row in rows]
+        axes.plot(*np.reshape(placed, (-1, 2)).T, ".", color=colour, label=name)
+        for row, place in zip(rows, placed, strict=True):
+            if row.line_covariance is None:
                 continue
-            variances, directions = np.linalg.eigh(covariance)
+            variances, directions = np.linalg.eigh(row.line_covariance)
             minor, major = 2 * np.sqrt(_CHI2_95_OF_2 * variances.clip(0))
             angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
-            axes.add_patch(Ellipse((gain, offset_nm), major, minor, angle=angle, fill=False, color=colour))
+            axes.add_patch(Ellipse(place, major, minor, angle=angle, fill=False, color=colour))
     axes.axvline(1.0, color="#9aa7b5", lw=0.8)
     axes.axhline(0.0, color="#9aa7b5", lw=0.8)
     axes.set(
