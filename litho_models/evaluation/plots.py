@@ -183,18 +183,19 @@ def print_gains(score: ModelScores) -> Figure:
     prints = sorted({row.print for row in score.scans})
     for number, name in enumerate(prints):
         colour = f"C{number % 10}"
-        rows = [
-            (row.slope, row.intercept_nm, row.line_covariance) for row in score.scans if row.print == name
+        placed = [
+            (row.slope, row.intercept_nm, row.line_covariance)
+            for row in score.scans
+            if row.print == name and row.slope is not None
         ]
-        placed = [(slope, at, covariance) for slope, at, covariance in rows if slope is not None]
-        axes.plot([slope for slope, *_ in placed], [at for _, at, _ in placed], ".", color=colour, label=name)
-        for slope, at, covariance in placed:
+        axes.plot([gain for gain, _, _ in placed], [at for _, at, _ in placed], ".", color=colour, label=name)
+        for gain, offset_nm, covariance in placed:
             if covariance is None:
                 continue
             variances, directions = np.linalg.eigh(covariance)
             minor, major = 2 * np.sqrt(_CHI2_95_OF_2 * variances.clip(0))
             angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
-            axes.add_patch(Ellipse((slope, at), major, minor, angle=angle, fill=False, color=colour))
+            axes.add_patch(Ellipse((gain, offset_nm), major, minor, angle=angle, fill=False, color=colour))
     axes.axvline(1.0, color="#9aa7b5", lw=0.8)
     axes.axhline(0.0, color="#9aa7b5", lw=0.8)
     axes.set(
