@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_models.evaluation.zoo_making import ZOO_MODELS, differing_metrics, make_zoo
 from litho_models.frozen import zoo
 

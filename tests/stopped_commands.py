@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.build import build_dataset
 from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.layouts import write_layout_set
+from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.virtual_fab import simulate

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from litho_data.commands.settings import leaves, setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
 from litho_design.optimisation.roughness import Roughness
 from litho_design.optimisation.stitching import Stitching

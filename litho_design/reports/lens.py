@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.focus_window import focus_window
 from litho_design.lenses.score import mtf

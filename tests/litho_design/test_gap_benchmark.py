@@ -18,7 +18,7 @@ from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers
+from litho_data.sharing.workers import Workers
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields

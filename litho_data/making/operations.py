@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.build.step import Facts, Files, Function, Inputs, Made, Operation, Params
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
+from litho_data.making.step import Facts, Files, Function, Inputs, Made, Operation, Params
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
@@ -33,7 +33,7 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
     def made(function: Function) -> Function:
         OPERATIONS[name] = Operation(
-            name, "1", function, tuple(takes.split()), (*code, "build/operations.py")
+            name, "1", function, tuple(takes.split()), (*code, "making/operations.py")
         )
         return function
 
@@ -86,10 +86,10 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     return arrays, facts
 
 
-@_operation("calibrate", "", "readers", "roughness", "build/calibration.py")
+@_operation("calibrate", "", "readers", "roughness", "making/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     """Scales of the microscope, from scans of what has a known size."""
-    from litho_data.build.calibration import SCALES, measure_scales
+    from litho_data.making.calibration import SCALES, measure_scales
 
     found = measure_scales(params["standards"], files)
     facts: Facts = {}
@@ -219,10 +219,10 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     "levelled_height_um height_um mask_level calibration",
     "register",
     "roughness",
-    "build/height_sigma.py",
+    "making/height_sigma.py",
 )
 def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.build.height_sigma import height_sigma
+    from litho_data.making.height_sigma import height_sigma
 
     sigma_um, budget = height_sigma(
         arrays["levelled_height_um"],

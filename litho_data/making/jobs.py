@@ -8,16 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
-from litho_data.build.operations import OPERATIONS
-from litho_data.build.quality import levelling_figures, noise_figures
-from litho_data.build.step import Done
 from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
+from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
+from litho_data.making.operations import OPERATIONS
+from litho_data.making.quality import levelling_figures, noise_figures
+from litho_data.making.step import Done
 from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
