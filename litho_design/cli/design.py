@@ -12,7 +12,6 @@ import typer
 
 from litho_data.commands.app import DaskOption, WorkersOption
 from litho_data.commands.settings import changed
-from litho_data.foundation.errors import InputError
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -26,7 +25,6 @@ from litho_design.cli.options import (
     ScanUnit,
     as_toml,
     measured_source,
-    numbers,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
@@ -35,7 +33,6 @@ from litho_design.optimisation.settings import DesignSettings
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 
 if TYPE_CHECKING:
-    from litho_design.judging.front import FrontResult
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
@@ -118,20 +115,11 @@ def hoe(
     out: Out,
     given: Given,
     target: Target = "text",
-    front: Annotated[
-        str | None,
-        typer.Option(
-            help="efficiency weights, comma-separated, such as 0,0.03,0.1,0.3,1: one design each, and the "
-            "front of efficiency against likeness"
-        ),
-    ] = None,
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
-    workers: WorkersOption = 1,
-    dask: DaskOption = None,
     large: Annotated[
         bool,
         typer.Option(
@@ -150,29 +138,15 @@ def hoe(
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
     settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
-    if front is None and (dask or workers > 1):
-        raise InputError("--workers and --dask", got="one design", wanted="several: --front")
-    fit: Any = {"device": device, "extrapolate": extrapolate}
-    if front is not None:
-        if large:
-            raise InputError("--large", got="--front", wanted="one design")
-        from litho_design.workflows.front import efficiency_front
+    from litho_design.large.bands import Ranks
+    from litho_design.workflows.design import design_hologram
 
-        result = efficiency_front(
-            target, model, out, weights=numbers("--front", front, float), settings=settings,
-            ensemble=ensemble or (), workers=workers, dask=dask, **fit,
-        )  # fmt: skip
-        _print_front(result, out)
-    else:
-        from litho_design.large.bands import Ranks
-        from litho_design.workflows.design import design_hologram
-
-        design = design_hologram(
-            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
-            band_px=band_px if large else None, **fit,
-        )  # fmt: skip
-        if not large or Ranks.joined().rank == 0:
-            _print_design(design, out)
+    design = design_hologram(
+        target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
+        band_px=band_px if large else None, device=device, extrapolate=extrapolate,
+    )  # fmt: skip
+    if not large or Ranks.joined().rank == 0:
+        _print_design(design, out)
 
 
 @takes_settings(ReliefSettings())
@@ -300,30 +274,6 @@ def compare(
     print(out / "report.html")
 
 
-@takes_settings(HologramSettings())
-def estimate(
-    model: Model,
-    given: Given,
-    ranks: Annotated[int, typer.Option(help="processes that would share the element", min=1)] = 1,
-    measure_px: Annotated[
-        str, typer.Option(help="sides of the elements to be measured, px; the largest counts")
-    ] = "1024,2048",
-    band_px: BandPx = 512,
-    device: Device = "cpu",
-    extrapolate: Extrapolate = False,
-) -> None:
-    """Measure small holograms here, and print what `hoe --large` with these settings would take.
-
-    Example: litho-design estimate --model zoo:physics --size-px 10000
-    """
-    from litho_design.large.cost import estimate_large
-
-    made = _settings(given, _hologram, "estimate")
-    sizes = numbers("--measure-px", measure_px, int)
-    for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
-        print(line)
-
-
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
 def settings(
     element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="what would be designed")],
@@ -360,19 +310,6 @@ def _settings(
         window = window.model_copy(update={"roughness": rough})
     measured = made.model_copy(update={"window": window})
     return measured if window is made.window else changed(measured, given.options)
-
-
-def _print_front(result: FrontResult, out: Path) -> None:
-    from litho_design.reports.advice import baseline_line
-
-    for point in result.points:
-        print(
-            f"efficiency weight {point.efficiency_weight:g}: {100 * point.eff_signal:.1f} % on the signal, "
-            f"{point.si_psnr_db:.2f} dB{'' if point.on_front else ', not on the front'}"
-        )
-    if result.baselines:
-        print(baseline_line(result.baselines))
-    print(out / "report.html")
 
 
 def _print_design(design: Design, out: Path) -> None:

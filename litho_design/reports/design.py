@@ -14,7 +14,7 @@ from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
 from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice, width_sentence
-from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
+from litho_design.reports.lens import add_lens_curves, decibels
 from litho_design.reports.parts import (
     BRIGHTEST,
     add_gauge,
@@ -102,8 +102,6 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     add_yield(
         page, draws, window, figures, measure_yield(draws, design.predicted, window, task.errors), task.errors
     )
-    if isinstance(task, LensTask):
-        add_lens_window(page, task.bench, print_um)
     page.heading("Printed height of the levels", folded=True)
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
@@ -69,46 +69,48 @@ def evaluate(
     floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
-    subject = {"dataset.name": dataset.name, "model.name": frozen.name}
-    require_own_folder(out, Evaluation.FILE_NAME, subject=subject)
-    every = dataset.scans()
-    kept = locked_by_the_card(frozen, dataset)
-    locked = sorted({*dataset.locked_ids, *kept})
-    if scan_ids is not None:
-        scans = [dataset.scan(scan_id) for scan_id in scan_ids]
-    else:
-        own = made_of_these_prints(frozen, dataset)
-        scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
-    if not scans:
-        raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
-    ids = [scan.id for scan in scans]
-    learned = card_background(frozen, scans) if background == "training" else None
-    heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
-    predictions = [Prediction.beside(learned, height) for height in heights]
-    protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
-    result = Evaluation(
-        run=run_info([protocol.seed], len(scans)),
-        dataset=dataset.dataset_id,
-        model=ModelRecord(
-            name=frozen.name,
-            sha256=frozen.sha256,
-            extrapolated=extrapolate,
-            parameters=frozen.card["parameters"],
-            tiles=tile_consistency(frozen.simulator, scans[0]),
-            cost=cost,
-        ),
-        split=ScoredSplit(
-            kind="given",
-            scored_ids=ids,
-            scored_ids_sha256=ids_sha256(ids),
-            lock_box=locked,
-            lock_box_opened=not set(locked).isdisjoint(ids),
-        ),
-        nuisance=protocol,
-        noise_floor=floor,
-        trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
-        scores=score_model(frozen.name, scans, predictions, protocol),
-    )
-    result.write(out)
-    write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
+    subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
+    with growing_folder(out, Evaluation.FILE_NAME, subject):
+        every = dataset.scans()
+        kept = locked_by_the_card(frozen, dataset)
+        locked = sorted({*dataset.locked_ids, *kept})
+        if scan_ids is not None:
+            scans = [dataset.scan(scan_id) for scan_id in scan_ids]
+        else:
+            own = made_of_these_prints(frozen, dataset)
+            scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
+        if not scans:
+            raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
+        ids = [scan.id for scan in scans]
+        learned = card_background(frozen, scans) if background == "training" else None
+        heights, cost = measured_predictions(
+            lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen)
+        )
+        predictions = [Prediction.beside(learned, height) for height in heights]
+        protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
+        result = Evaluation(
+            run=run_info([protocol.seed], len(scans)),
+            dataset=dataset.dataset_id,
+            model=ModelRecord(
+                name=frozen.name,
+                sha256=frozen.sha256,
+                extrapolated=extrapolate,
+                parameters=frozen.card["parameters"],
+                tiles=tile_consistency(frozen.simulator, scans[0]),
+                cost=cost,
+            ),
+            split=ScoredSplit(
+                kind="given",
+                scored_ids=ids,
+                scored_ids_sha256=ids_sha256(ids),
+                lock_box=locked,
+                lock_box_opened=not set(locked).isdisjoint(ids),
+            ),
+            nuisance=protocol,
+            noise_floor=floor,
+            trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
+            scores=score_model(frozen.name, scans, predictions, protocol),
+        )
+        write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
+        result.write(out)
     return result
