@@ -101,7 +101,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
     return {"micrograph": grey.astype(np.uint16)}, {**facts, "header": {}}
 
 
-@_operation("find-edges", "micrograph", "build/contour.py")
+@_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     """Edges of the film; the height that they stand for is what is registered."""
     from litho_data.making.contour import coverage, find_edges
@@ -114,7 +114,7 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 @_operation(
-    "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "build/contour.py"
+    "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     """The film on the layout's grid: its height times the share of a pixel that it covers, without dirt."""
