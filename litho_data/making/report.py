@@ -53,9 +53,6 @@ _TABLE: dict[str, tuple[str, str]] = {
     "rotation_deg": ("rotation (°)", "angle of the scan on its layout, in its middle"),
     "singular_min": ("scale, smallest", "stretch of the scan along the direction with the least; 1 is none"),
     "singular_max": ("scale, largest", "stretch along the direction with the most"),
-    "noise_x_nm": ("noise along x (nm)", "noise of pixels, from differences along x"),
-    "noise_y_nm": ("noise along y (nm)", "noise of pixels, from differences along y"),
-    "row_step_nm": ("row steps (nm)", "standard deviation of the steps from one line to the next"),
     "removed_sd_nm": (
         "removed by levelling, sd (nm)",
         "standard deviation of the surface that levelling removed",

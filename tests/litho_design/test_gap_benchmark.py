@@ -32,7 +32,7 @@ TINY = Effort.small(64)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRINT_KNOBS)
 def test_every_hidden_effect_is_ten_nanometres(name):
-    rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0), policy="full")
+    rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0))
     # Strengths are stated with three digits and were searched to 1 %.
     assert rms == pytest.approx(10.0, rel=0.02)
 
