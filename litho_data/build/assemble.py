@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from litho_data.build.jobs import Job
-from litho_data.build.operations import no_recipe
+from litho_data.build.operations import READERS, no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.store.partial import outputs_of
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
-from litho_data.store.write import consolidate, write_samples, write_table
+from litho_data.store.write import SHOWN, consolidate, write_samples, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +91,11 @@ def records_of_use(records: Sequence[Record]) -> list[Record]:
 def dataset_facts(card: Card) -> dict[str, Any]:
     """What a card says about all scans, as part of the dataset's hash."""
     layout = card.layout
-    facts = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um, "levels": layout.levels}
+    facts: dict[str, Any] = {
+        name: getattr(layout, name) for name in ("pitch_um", "level_height_um", "levels")
+    }
+    if card.scan.instrument != "afm":
+        facts["instrument"] = card.scan.instrument
     write = card.write.model_dump(exclude_none=True) if card.write else {}
     return {**facts, "write": write} if write else facts
 
@@ -147,7 +151,7 @@ def quality_table(records: Sequence[Record]) -> pd.DataFrame:
     rows = []
     for record in records_of_use(records):
         ny, nx = _shape_of(record, "mask_level")
-        scan_ny, scan_nx = _shape_of(record, "raw_height_um")
+        scan_ny, scan_nx = _shape_of(record, *SHOWN)
         pitch_y_um, pitch_x_um = record.get("pitch_um", record["read"]["pitch_um"])
         shape = {"layout_ny": ny, "layout_nx": nx, "scan_ny": scan_ny, "scan_nx": scan_nx}
         pitch = {"scan_pitch_y_um": pitch_y_um, "scan_pitch_x_um": pitch_x_um}
@@ -198,8 +202,8 @@ def _identity(record: Record) -> dict[str, Any]:
     return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
 
 
-def _shape_of(record: Record, name: str) -> tuple[int, int]:
-    shape = next(output["shape"] for output in outputs_of(record) if output["name"] == name)
+def _shape_of(record: Record, *names: str) -> tuple[int, int]:
+    shape = next(output["shape"] for output in outputs_of(record) if output["name"] in names)
     return int(shape[0]), int(shape[1])
 
 
@@ -253,6 +257,6 @@ def _used_sha256(record: Mapping[str, Any], name: str) -> str:
 def _facts(record: Mapping[str, Any] | None, name: str) -> dict[str, Any]:
     """Facts about a scan file from its reader; none for a layout."""
     for step in record["steps"] if record else ():
-        if step["op"] == "read-scan" and step["inputs"][0]["name"] == name and record:
+        if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])
     return {}

@@ -79,7 +79,7 @@ def build_dataset(
 
 def _recipe(listing: Listing) -> dict[str, Any]:
     level = listing.card.process.level
-    if level is None and listing.card.scan.levelled:
+    if level is None and (listing.card.scan.levelled or listing.card.scan.instrument == "sem"):
         return no_recipe()
     return load_recipe(None if level is None else listing.card_path.parent / level)
 
@@ -199,6 +199,8 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     # A search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
         read = fields[key].read()
+        if "raw_height_um" not in read.arrays:
+            continue
         own = layouts[key].tobytes() if key in layouts else None
         others = {name: layouts[name] for held, name in distinct.items() if held != own}
         height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]

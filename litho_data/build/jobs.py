@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
-from litho_data.build.operations import OPERATIONS
+from litho_data.build.operations import OPERATIONS, READERS
 from litho_data.build.quality import levelling_figures, noise_figures
 from litho_data.build.step import Done
 from litho_data.cards.card import Card
@@ -24,6 +24,8 @@ from litho_data.store.partial import PartialStore, Piece
 _LAYOUT_AWARE = "layout-aware"
 # Rim of level 0 around a field that is alone on the substrate: models extend the edge of a layout.
 _BARE_PX = 2
+# What a micrograph shows so deep within film or gap of its layout, px, is dirt or a pit.
+_DIRT_PX = 5
 
 
 class Job(Protocol):
@@ -110,7 +112,10 @@ class FieldJob:
 
     def read(self) -> Done:
         """The scan as it was read; InputError if that fails."""
-        return OPERATIONS["read-scan"].run(self._read_params, {self.scan_name: self.field.scan}, {})
+        file = {self.scan_name: self.field.scan}
+        if self._is_micrograph:
+            return OPERATIONS["read-micrograph"].run({"size_um": self._read_params["size_um"]}, file, {})
+        return OPERATIONS["read-scan"].run(self._read_params, file, {})
 
     def calibrate(self) -> Done | None:
         """The scales of the microscope, None without standards; InputError if these do not show them."""
@@ -131,12 +136,14 @@ class FieldJob:
         arrays = {name: array for done in steps for name, array in done.arrays.items()}
         facts = {done.step.op: done.facts for done in steps}
         quality: dict[str, Any] = {}
-        for op in ("register", "uncertainty", "tip", "calibrate"):
+        for op in ("register", "uncertainty", "tip", "calibrate", "find-edges", "cover"):
             quality |= facts.get(op, {})
-        notes = [note for op in ("read-scan", "level") for note in facts[op].get("notes", ())]
+        read = next(facts[op] for op in READERS if op in facts)
+        notes = [*read.get("notes", ()), *facts.get("level", {}).get("notes", ())]
         said = (quality.get("warning", ""), *notes)
         quality["warning"] = "; ".join(filter(None, said))
-        quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
+        if "raw_height_um" in arrays:
+            quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
         record = {
@@ -149,8 +156,8 @@ class FieldJob:
             "steps": [done.step.to_record() for done in steps],
             "quality": quality,
             "notes": notes,
-            "read": facts["read-scan"],
-            "pitch_um": scaled_pitch_um(facts["read-scan"]["pitch_um"], facts.get("calibrate", {})),
+            "read": read,
+            "pitch_um": scaled_pitch_um(read["pitch_um"], facts.get("calibrate", {})),
             "software": software_record(),
         }
         return Piece(json.loads(json.dumps(record)), arrays)
@@ -176,7 +183,19 @@ class FieldJob:
             pitch_um = scaled_pitch_um(pitch_um, scales.facts)
         pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
+        # What lies around a field is not in its layout: its outermost pixels are no evidence.
+        aside = {"edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else {}
         register_params = self.register_params(pitch_um, read.facts["fast_axis"])
+        if self._is_micrograph:
+            full_level = self.card.layout.levels - 1
+            film = {"film_um": full_level * self.card.layout.level_height_um}
+            edges = made("find-edges", {**pitch, **film})
+            yield edges
+            yield made("register", register_params)
+            sigma = {"edge_sigma_um": edges.facts["edge_sigma_nm"] / 1e3, "full_level": full_level}
+            place = {**pitches, "layout_shape": list(held["mask_level"].shape)}
+            yield made("cover", {**place, **film, **sigma, "dirt_px": _DIRT_PX, "edge_px": 0, **aside})
+            return
         recipe = dict(self.recipe)
         if layout is None:
             # A reference has none.
@@ -190,8 +209,6 @@ class FieldJob:
         yield registered
         if self.card.process.tip is not None:
             yield made("tip", {**pitch, "radius_um": self.card.process.tip})
-        # What lies around a field is not in its layout: its outermost pixels are no evidence.
-        aside = {"edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else {}
         yield made("resample", {**pitches, "layout_shape": list(held["mask_level"].shape), **aside})
         fit = {name: registered.facts[name] for name in ("blur_um", "model")}
         lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(recipe["step"])}
@@ -203,11 +220,16 @@ class FieldJob:
             return None
         file = {self.layout_name: self.field.layout}
         params: dict[str, Any] = {"levels": self.card.layout.levels}
-        if self.card.layout.grey_per_level is not None:
-            params["grey_per_level"] = self.card.layout.grey_per_level
+        for name in ("grey_per_level", "average_px"):
+            if (value := getattr(self.card.layout, name)) is not None:
+                params[name] = value
         if self._surround == "substrate":
             params["bare_px"] = _BARE_PX
         return OPERATIONS["read-layout"].run(params, file, {})
+
+    @property
+    def _is_micrograph(self) -> bool:
+        return self.card.scan.instrument == "sem"
 
     @property
     def _surround(self) -> str | float | None:

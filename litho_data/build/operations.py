@@ -26,6 +26,8 @@ _OBLONG = 0.01
 
 
 OPERATIONS: dict[str, Operation] = {}
+READERS = ("read-scan", "read-micrograph")
+"""Of what the microscope wrote."""
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
@@ -58,7 +60,8 @@ def no_recipe() -> dict[str, Any]:
 def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_layout
 
-    level = read_layout(files[0], levels=params["levels"], grey_per_level=params.get("grey_per_level"))
+    stated = {name: params[name] for name in ("grey_per_level", "average_px") if name in params}
+    level = read_layout(files[0], levels=params["levels"], **stated)
     if level.max() >= params["levels"]:
         wanted = f"at most {params['levels'] - 1}, since the card says levels = {params['levels']}"
         raise InputError(f"layout {files[0]}: highest level", got=int(level.max()), wanted=wanted)
@@ -84,6 +87,53 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
         "header": scan.header,
     }
     return arrays, facts
+
+
+@_operation("read-micrograph", "", "readers")
+def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
+    from litho_data.readers.picture import read_picture
+
+    grey = read_picture(files[0], "micrograph")
+    if grey.dtype.kind != "u" or grey.dtype.itemsize > 2:
+        raise InputError(f"micrograph {files[0]}", got=str(grey.dtype), wanted="grey values of 8 or 16 bits")
+    pitch_um = [size / length for size, length in zip(params["size_um"], grey.shape, strict=True)]
+    facts = {"pitch_um": pitch_um, "reader": "picture", "unit": "", "channel": "", "fast_axis": None}
+    return {"micrograph": grey.astype(np.uint16)}, {**facts, "header": {}}
+
+
+@_operation("find-edges", "micrograph", "build/contour.py")
+def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
+    """Edges of the film; the height that they stand for is what is registered."""
+    from litho_data.build.contour import coverage, find_edges
+
+    edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
+    height = params["film_um"] * coverage(edges.distance_px, 1.0)
+    found = {"edge_distance_um": edges.distance_px * pitch_um, "levelled_height_um": height}
+    facts = {"edge_sigma_nm": 1e3 * edges.sigma_px * pitch_um, "speck_px": int(edges.specks.sum())}
+    return {name: array.astype(np.float32) for name, array in found.items()}, facts
+
+
+@_operation(
+    "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "build/contour.py"
+)
+def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
+    """The film on the layout's grid: its height times the share of a pixel that it covers, without dirt."""
+    from litho_data.build.contour import coverage, foreign
+    from litho_data.register.refine import interior_of
+
+    distance, valid = _on_layout(arrays["edge_distance_um"], params, arrays)
+    level, pitch_um, film_um = arrays["mask_level"], params["layout_pitch_um"], params["film_um"]
+    valid &= interior_of(valid.shape, params["edge_px"])
+    if "defect" in arrays:
+        valid &= ~arrays["defect"]
+    covered = coverage(np.where(valid, distance, np.nan), pitch_um)
+    dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
+    valid &= ~dirt
+    sigma_um = params["edge_sigma_um"]
+    above, below = (coverage(distance + shift, pitch_um) for shift in (sigma_um, -sigma_um))
+    maps = {"height_um": film_um * covered, "height_sigma_um": film_um * (above - below) / 2}
+    made = {name: np.where(valid, one, np.nan).astype(np.float32) for name, one in maps.items()}
+    return {**made, "valid": valid}, {"dirt_share": float(dirt.mean())}
 
 
 @_operation("calibrate", "", "readers", "roughness", "build/calibration.py")
@@ -189,29 +239,31 @@ def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("resample", "levelled_height_um scan_to_layout bend_um defect tip_certain", "register")
 def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.register import Bend, resample_to_layout
     from litho_data.register.refine import interior_of
 
-    levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
-    bend = Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if "bend_um" in arrays else None
-
-    def on_layout(scan_map: Array) -> tuple[Array, Array]:
-        return resample_to_layout(
-            scan_map.astype(float),
-            arrays["scan_to_layout"],
-            tuple(params["layout_shape"]),
-            scan_pitch_um=pitch_um,
-            layout_pitch_um=params["layout_pitch_um"],
-            bend_um=bend,
-        )
-
-    height, valid = on_layout(levelled)
+    height, valid = _on_layout(arrays["levelled_height_um"], params, arrays)
     if "defect" in arrays:
         valid &= ~arrays["defect"]
     if "tip_certain" in arrays:
-        valid &= on_layout(arrays["tip_certain"])[0] > 0.5
+        valid &= _on_layout(arrays["tip_certain"], params, arrays)[0] > 0.5
     valid &= interior_of(valid.shape, params.get("edge_px", 0))
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
+
+
+def _on_layout(scan_map: Array, params: Params, arrays: Inputs) -> tuple[Array, Array]:
+    """A map of the scan's frame at the layout's pixels, and where it is known."""
+    from litho_data.register import Bend, resample_to_layout
+
+    pitch_um = tuple(params["scan_pitch_um"])
+    bend = Bend.of_scan(arrays["bend_um"], scan_map.shape, pitch_um) if "bend_um" in arrays else None
+    return resample_to_layout(
+        scan_map.astype(float),
+        arrays["scan_to_layout"],
+        tuple(params["layout_shape"]),
+        scan_pitch_um=pitch_um,
+        layout_pitch_um=params["layout_pitch_um"],
+        bend_um=bend,
+    )
 
 
 @_operation(

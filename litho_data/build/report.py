@@ -26,7 +26,7 @@ _MAX_SCANS_SHOWN = 48
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",
-    "raw (nm)": "cividis",
+    "raw (nm; grey of a micrograph)": "cividis",
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
@@ -204,9 +204,15 @@ def _shown_ids(store: Store) -> list[str]:
 def _stages(store: Store, scan_id: str) -> list[Array]:
     """Thumbnails of a scan, in the order of ``_STAGES``."""
     scan = store.scan(scan_id)
-    raw = store.scan_frame(scan_id, "raw_height_um")
-    images = [scan.mask_level, raw * 1e3, scan.height_um * 1e3, _residual_nm(scan)]
+    images = [scan.mask_level, _raw(store, scan_id), scan.height_um * 1e3, _residual_nm(scan)]
     return [thumbnail(image) for image in images]
+
+
+def _raw(store: Store, scan_id: str) -> Array:
+    """Heights in nm or, of a micrograph, grey values."""
+    if store.instrument == "sem":
+        return store.scan_frame(scan_id, "micrograph").astype(float)
+    return store.scan_frame(scan_id, "raw_height_um") * 1e3
 
 
 def _residual_nm(scan: PrintedScan) -> Array:

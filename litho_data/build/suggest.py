@@ -90,9 +90,11 @@ def suggest_recipe(
         data_dir: folder of the raw files, as for ``build_dataset``.
 
     Raises:
-        InputError: a bad card, or no scan that can be read and registered.
+        InputError: a bad card, one of micrographs, or no scan that can be read and registered.
     """
     listing = list_fields(card_path, data_dir)
+    if listing.card.scan.instrument == "sem":
+        raise InputError("recipes to compare", got="micrographs", wanted="scans of heights")
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
     # Three apart; others where one of them cannot be used.
     places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()

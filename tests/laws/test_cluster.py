@@ -26,7 +26,6 @@ from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
 from litho_design.workflows.compare import compare
-from litho_design.workflows.front import efficiency_front
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop.bases import choose_base
@@ -198,25 +197,6 @@ def test_designs_are_the_same_to_the_bit(
         # Hashes of levels, height, image, target.
         assert one.files == other.files != {}
         assert one.predicted == other.predicted
-
-
-@pytest.mark.long
-def test_a_front_is_the_same_to_the_bit(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    tiny = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 4, "search.polish_rounds": 1}
-    settings = hologram_settings(changes={**tiny, "window.yield_draws": 2, "window.defocus_sd_um": 0.5})
-    here, there = (
-        efficiency_front(
-            "ring", "zoo:physics", name, weights=(0.0, 0.3), settings=settings, announce=False, dask=dask
-        )
-        for name, dask in (("a", None), ("b", address))
-    )
-    assert here.points == there.points
-    for point in here.points:
-        one, other = (Design.read(tmp_path / name / point.folder) for name in "ab")
-        assert one.files == other.files != {}
 
 
 @pytest.mark.long

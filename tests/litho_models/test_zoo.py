@@ -11,10 +11,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from examples.make_zoo import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 from litho_data.foundation.errors import InputError
 from litho_models import load_frozen, save_frozen
 from litho_models.cli.app import app
-from litho_models.evaluation.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.readme import model_readme

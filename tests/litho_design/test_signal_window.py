@@ -1,19 +1,13 @@
-"""Trade-offs of a hologram: the front of efficiency against likeness, and the signal window."""
+"""The signal window of a hologram: beyond it light is free, which buys likeness inside."""
 
 from __future__ import annotations
-
-import sys
 
 import numpy as np
 import pytest
 import torch
 
-from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings
-from litho_design.cli.app import main
 from litho_design.holograms.loss import HologramLoss, counted_pixels, hologram_loss
-from litho_design.judging.front import FrontResult
-from litho_design.workflows.front import efficiency_front
 
 TINY = {
     "layout.size_px": 48,
@@ -23,27 +17,6 @@ TINY = {
     "window.yield_draws": 2,
     "window.defocus_sd_um": 0.5,
 }
-
-
-@pytest.mark.pictures
-def test_the_front_trades_efficiency_for_likeness(tmp_path, monkeypatch, capsys):
-    words = ["hoe", "--model", "none", "--target", "ring", "--front", "0,3", "--out", str(tmp_path)]
-    words += [word for path, value in TINY.items() for word in ("--set", f"{path}={value}")]
-    monkeypatch.setattr(sys, "argv", ["litho-design", *words])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 0
-    alike, bright = FrontResult.read(tmp_path).points
-    assert (alike.efficiency_weight, bright.efficiency_weight) == (0, 3)
-    assert bright.eff_signal > alike.eff_signal
-    assert alike.si_psnr_db > bright.si_psnr_db
-    assert alike.on_front
-    assert bright.on_front
-    assert f"{alike.si_psnr_db:.2f} dB" in capsys.readouterr().out
-    assert (tmp_path / alike.folder / "report.html").exists()
-    assert "efficiency_weight" in (tmp_path / "front.csv").read_text()
-    with pytest.raises(InputError, match="two or more"):
-        efficiency_front("ring", "none", tmp_path / "other", weights=(0.1, 0.1))
 
 
 def test_light_beyond_the_signal_window_is_free():
