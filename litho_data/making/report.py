@@ -166,12 +166,10 @@ def _raw(store: Store, scan_id: str) -> Array:
 def _residual_nm(scan: PrintedScan) -> Array:
     from litho_data.register import predicted_topography
 
-    layout = predicted_topography(scan.mask_level, _BLUR_PX)
-    x, z = layout[scan.valid].astype(float), scan.height_um[scan.valid].astype(float)
-    x_mean, z_mean = (float(values.mean()) if values.size else 0.0 for values in (x, z))
-    variance = float(((x - x_mean) ** 2).sum())
-    gain = float(((x - x_mean) * (z - z_mean)).sum()) / variance if variance > 0 else 0.0
-    return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
+    layout = predicted_topography(scan.mask_level, _BLUR_PX).astype(float)
+    design = np.stack([layout, np.ones(scan.shape)], axis=-1)
+    response, *_ = np.linalg.lstsq(design[scan.valid], scan.height_um[scan.valid].astype(float), rcond=None)
+    return (scan.height_um - design @ response) * 1e3
 
 
 def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
