@@ -26,31 +26,7 @@ if TYPE_CHECKING:
 # Column of a table to its name for people and what it is; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
-_UNITS = {
-    "per_um": "1/µm",
-    "um2": "µm²",
-    "deg": "°",
-    "um": "µm",
-    "nm": "nm",
-    "px": "px",
-    "mib": "MiB",
-    "db": "dB",
-    "s": "s",
-    "waves": "waves",
-}
-_SHORT = {"ci95": "95 % interval", "mae": "MAE", "rmse": "RMSE", "sd": "standard deviation", "psnr": "PSNR"}
-_SHORT |= {
-    "ssim": "SSIM",
-    "id": "scan",
-    "fwhm": "FWHM",
-    "mtf": "MTF",
-    "psf": "PSF",
-    "sha256": "SHA-256",
-    "k": "k",
-    "icc": "ICC",
-    "eff": "efficiency",
-    "si": "scale-invariant",
-}
+_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
 # Columns that hold keys, which are spelt out like the names of columns.
@@ -224,7 +200,7 @@ def capitalised(text: str) -> str:
 def spelt_out(key: str) -> str:
     """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:
-        return _SHORT.get(key, key)
+        return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")
     if more and "_" in head:
         return f"{spelt_out(head)}, {more}"
@@ -232,11 +208,11 @@ def spelt_out(key: str) -> str:
     if between:
         return f"{spelt_out(head)}, standard deviation between {more}"
     words, unit = key, ""
-    for suffix, text in _UNITS.items():
+    for suffix, text in _SPELT["units"].items():
         if key.endswith(f"_{suffix}"):
             words, unit = key.removesuffix(f"_{suffix}"), f" ({text})"
             break
-    return " ".join(_SHORT.get(word, word) for word in re.split("_+", words)) + unit
+    return " ".join(_SPELT["short"].get(word, word) for word in re.split("_+", words)) + unit
 
 
 def _text(value: Any, digits: int) -> str:
