@@ -39,6 +39,7 @@ NARROW = {
     },
     "pbl": {"sigma_diffusion_init_um": 0.3},
     "physics": {"sigma_diffusion_init_um": 0.3},
+    "e-beam": {"forward_um": 0.08, "back_um": 0.2, "diffusion_um": 0.09, "diffusion_max_um": 0.2},
     "fno": {"width": 6, "modes": (4, 4), "projection_channels": 8},
 }
 # Of the default variant alone.
