@@ -118,9 +118,7 @@ def score(
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option(
-            "--stream", help="hologram of any size: printed and scored band by band, the rest on disk"
-        ),
+        typer.Option("--stream", help="large hologram: printed and scored band by band"),
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",
