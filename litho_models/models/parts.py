@@ -13,7 +13,8 @@ from torch import Tensor
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
 from litho_models.simulator import crop_border
 
-_FLATTEST = 1e-3
+# Change of the resist from pixel to pixel below which there is no edge.
+_FLATTEST = 5e-3
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
