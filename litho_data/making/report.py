@@ -14,7 +14,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.making.gratings import GratingScan, grating_scans
 from litho_data.making.verdict import verdict_of
 from litho_data.reports.page import Page
-from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
+from litho_data.reports.pictures import colour_bar_png, coloured_png, limits, thumbnail
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
@@ -174,5 +174,5 @@ def _residual_nm(scan: PrintedScan) -> Array:
 
 def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
     values = np.concatenate([image.ravel() for image in images])
-    low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
+    low, high = limits(values)
     return (-max(-low, high), max(-low, high)) if symmetric else (low, high)
