@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from litho_data.foundation.app import DaskOption, WorkersOption
-from litho_data.foundation.settings import changed
+from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.commands.settings import changed
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -50,12 +50,6 @@ SpreadOf = Annotated[
         help="dataset store: take the spread of gain and offset from its measured prints, the locked "
         "scans left out",
         hidden=True,
-    ),
-]
-RoughnessOf = Annotated[
-    Path | None,
-    typer.Option(
-        help="noise.json of litho-models noise: the surface of a print is as rough as measured", hidden=True
     ),
 ]
 Ensemble = Annotated[
@@ -116,7 +110,6 @@ def hoe(
     given: Given,
     target: Target = "text",
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
@@ -137,7 +130,7 @@ def hoe(
 
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
-    settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
+    settings = _settings(given, _hologram, "hoe", spread_of)
     from litho_design.large.bands import Ranks
     from litho_design.workflows.design import design_hologram
 
@@ -168,7 +161,6 @@ def correct(
     scan_levelling: ScanLevelling = "bow",
     scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = True,
@@ -180,7 +172,7 @@ def correct(
     Example: litho-design correct blaze --model zoo:pbl --out blaze
     Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
     """
-    settings = _settings(given, relief_settings, "correct", spread_of, roughness_of)
+    settings = _settings(given, relief_settings, "correct", spread_of)
     from litho_design.workflows.design import correct as correct_relief
 
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
@@ -199,7 +191,6 @@ def lens(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
@@ -214,7 +205,7 @@ def lens(
 
     Example: litho-design lens --model zoo:pbl --distance-um 200 --out lens
     """
-    settings = _settings(given, _lens, "lens", spread_of, roughness_of)
+    settings = _settings(given, _lens, "lens", spread_of)
     from litho_design.workflows.design import design_lens
 
     design = design_lens(
@@ -243,7 +234,6 @@ def compare(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
     seeds: Annotated[int, typer.Option(help="number of seeds: 0, 1, 2 …")] = 3,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
@@ -256,10 +246,10 @@ def compare(
     """
     settings: Any
     if task == "hoe":
-        settings = _settings(given, _hologram, task, spread_of, roughness_of)
+        settings = _settings(given, _hologram, task, spread_of)
     else:
         kind = {"task": task.removeprefix("lens-")}
-        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of, roughness_of)
+        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
     from litho_design.judging.gap import headline
     from litho_design.workflows.compare import compare as run_comparison
 
@@ -293,23 +283,16 @@ def _settings(
     make: Callable[[Mapping[str, Any]], S],
     task: str,
     spread_of: Path | None = None,
-    roughness_of: Path | None = None,
 ) -> S:
     """The preset, then the settings file, the measured spreads and the command line, each over the last."""
     made = make(given.over(make({}), task))
-    window = made.window
-    if spread_of is not None:
-        from litho_data.store import open_store
-        from litho_design.optimisation.process_window import measured_window
+    if spread_of is None:
+        return made
+    from litho_data.store import open_store
+    from litho_design.optimisation.process_window import measured_window
 
-        window = measured_window(open_store(spread_of), window)
-    if roughness_of is not None:
-        from litho_design.optimisation.roughness import measured_roughness
-
-        rough = measured_roughness(roughness_of, made.layout.level_height_um)
-        window = window.model_copy(update={"roughness": rough})
-    measured = made.model_copy(update={"window": window})
-    return measured if window is made.window else changed(measured, given.options)
+    window = measured_window(open_store(spread_of), made.window)
+    return changed(made.model_copy(update={"window": window}), given.options)
 
 
 def _print_design(design: Design, out: Path) -> None:

@@ -26,10 +26,13 @@ def headline_table(
 ) -> pd.DataFrame:
     """One row per model: both errors with intervals, what they have above the noise floor, spread and bias.
 
-    Below them the floor itself, under each column that of its own scan terms.
+    Below them the floor itself, under each column that of its own scan terms. Of films the errors of edges
+    and features.
     """
     import pandas as pd
 
+    if scores[0].seen_by == "sem":
+        return pd.DataFrame([_film_row(score) for score in scores])
     below = floor.at(protocol.policy)
     least = floor.mae_at(protocol.policy)
     rows = [
@@ -55,6 +58,20 @@ def headline_table(
         "scans": "",
     }
     return pd.DataFrame([*rows, known])
+
+
+def _film_row(score: ModelScores) -> dict[str, Any]:
+    return {
+        "model": score.model,
+        "edge_mean_nm": score.edge_mean_nm,
+        "edge_mean_ci95_nm": interval_text(score.edge_mean_ci95_nm),
+        "edge_p95_nm": score.edge_p95_nm,
+        **score.metrics,
+        "edge_unmatched": score.edge_unmatched,
+        "edge_unmatched_expected": score.edge_unmatched_expected,
+        "mae_abs_nm": score.mae_abs_nm,
+        "scans": len(score.scans),
+    }
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
@@ -83,7 +100,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: phase error, and all metrics of ``metric_registry``."""
-    keys = [metric.key for metric in registered_metrics()]
+    keys = [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
     return [
         {
             "model": s.model,
@@ -194,8 +211,8 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
             notes.append(
                 f"{s.model}: {s.dropped_pixels} pixels were not measured or not valid and are not scored."
             )
-    if scores:
-        s = min(scores, key=lambda entry: entry.mae_datum_free_nm)
+    if scores and scores[0].seen_by == "afm":
+        s = min(scores, key=lambda entry: entry.leading_nm)
         notes.append(
             f"Line offsets left by {s.model}: {s.row_offset_sd_nm:.1f} nm along the rows of the layout, "
             f"{s.scan_line_offset_sd_nm:.1f} nm along the scan's own lines. Offsets that follow the layout "

@@ -8,23 +8,26 @@ from litho_models.scoring.pairs import Paired
 
 # What counts as more than chance: an interval without zero, and sign flips of the independent units below.
 _CHANCE = 0.05
+_OF = {"afm": "", "sem": " of the edges"}
 
 
 def benchmark_verdict(result: Benchmark) -> str:
     """Which model predicts best, by how much, whether that is more than chance, and what noise leaves."""
-    ranking = sorted(result.scores, key=lambda one: one.mae_datum_free_nm)
+    ranking = sorted(result.scores, key=lambda one: one.leading_nm)
     best, *others = ranking
     unit = "quadrants" if result.split.kind == "paper" else "scans"
     text = (
-        f"{best.model} is best at predicting {unit} it was not trained on: {best.mae_datum_free_nm:.2f} nm "
-        f"mean error over {len(best.scans)} {unit}. "
+        f"{best.model} is best at predicting {unit} it was not trained on: {best.leading_nm:.2f} nm "
+        f"mean error{_OF[best.seen_by]} over {len(best.scans)} {unit}. "
     )
     if others:
         second = others[0]
-        text += f"{second.model} is next with {second.mae_datum_free_nm:.2f} nm; "
+        text += f"{second.model} is next with {second.leading_nm:.2f} nm; "
         names = {best.model, second.model}
         pair = next((one for one in result.paired if {one.first, one.second} == names), None)
         text += "they were not compared scan by scan. " if pair is None else f"{chance_text(pair)}. "
+    if best.seen_by == "sem":
+        return text.rstrip()
     return text + _share_of_noise(result.noise_floor, best.mae_datum_free_nm, result.nuisance.policy)
 
 
@@ -33,6 +36,9 @@ def evaluation_verdict(result: Evaluation) -> str:
     scores = result.scores
     trained = len(result.trained_on_scored_scans)
     seen = f" ({trained} of which it was trained on)" if trained else ""
+    if scores.seen_by == "sem":
+        of_edges = f"its edges lie {scores.leading_nm:.2f} nm from the measured ones"
+        return f"{result.model.name}: {of_edges}, mean over {len(scores.scans)} scans{seen}."
     return (
         f"{result.model.name} is off by {scores.mae_abs_nm:.1f} nm over {len(scores.scans)} scans{seen} as "
         f"it stands, and by {scores.mae_datum_free_nm:.2f} nm once the scan's own terms are fitted. "

@@ -48,7 +48,7 @@ def _over_units(differences_nm: Sequence[float], groups: Sequence[str] | None, s
 
 
 class Paired(Record):
-    """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better.
+    """Mean over scans of first minus second leading error; negative means the first is better.
 
     ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
     """
@@ -64,12 +64,12 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the datum-free errors of the same scans, which meet by id: results list them by fold.
+    """Compare the leading errors of the same scans, which meet by id: results list them by fold.
 
     Raises:
         InputError: scores of different scans.
     """
-    errors = [{row.scan: row.mae_datum_free_nm for row in score.scans} for score in (first, second)]
+    errors = [score.leading_of_scans_nm for score in (first, second)]
     if errors[0].keys() != errors[1].keys():
         counts = " and ".join(str(len(found)) for found in errors)
         raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +10,15 @@ from pydantic import Field
 
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
+LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+"""The error by which models are ranked and compared, by the instrument."""
 
 
 class Prediction(NamedTuple):
@@ -110,6 +114,8 @@ class ModelScores(MetricValues):
 
     model: str
     scans: list[ScanRow]
+    seen_by: Instrument = "afm"
+    edge_mean_ci95_nm: Interval = None
     mae_abs_nm: float
     mae_abs_ci95_nm: Interval
     bias_nm: float
@@ -126,3 +132,20 @@ class ModelScores(MetricValues):
     scan_line_offset_sd_nm: float
     dropped_pixels: int
     constant_predictions: int
+
+    @property
+    def leading_nm(self) -> float:
+        """The error that ranks models: of edges for films, of heights else; infinite without an edge."""
+        value = getattr(self, LEADING[self.seen_by])
+        return math.inf if value is None else float(value)
+
+    @property
+    def leading_ci95_nm(self) -> Interval:
+        """Its interval."""
+        return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
+
+    @property
+    def leading_of_scans_nm(self) -> dict[str, float]:
+        """The same of every scan by id; not a number where there is no edge."""
+        values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
+        return {scan: math.nan if value is None else value for scan, value in values.items()}

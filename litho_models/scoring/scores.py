@@ -61,6 +61,8 @@ def score_model(
     return ModelScores(
         model=name,
         scans=table,
+        seen_by=scans[0].seen_by,
+        edge_mean_ci95_nm=interval([row.edge_mean_nm for row in table if row.edge_mean_nm is not None]),
         mae_abs_nm=_mean(chosen, "mae_abs_nm"),
         mae_abs_ci95_nm=interval([score.mae_abs_nm for score in chosen]),
         bias_nm=_mean(chosen, "bias_nm"),

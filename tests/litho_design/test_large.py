@@ -1,4 +1,4 @@
-"""Large elements: bands of rows give what one piece gives, on any number of processes and from disk."""
+"""Large elements: bands of rows give what one piece gives, on any number of processes."""
 
 from __future__ import annotations
 
@@ -140,28 +140,27 @@ def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alon
     np.testing.assert_array_equal(*layouts)
 
 
-def test_a_score_from_disk_is_that_of_the_whole(alone, tmp_path):
+def test_a_score_in_bands_is_that_of_the_whole(alone, tmp_path):
     design, printer = alone / "design", large_rank.printer()
-    (streamed,) = score(design, tmp_path / "disk", judges=[printer], band_px=48).scores
+    (streamed,) = score(design, tmp_path / "bands", judges=[printer], band_px=48).scores
     (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
     assert len(streamed.figures) == 10
     for name, value in streamed.figures.items():
         # Waves differ by rounding, 1e-6 of the largest amplitude; figures are sums of squares of them.
         assert value == pytest.approx(whole.figures[name], rel=1e-4, abs=1e-7), name
     assert streamed.rms_height_difference_um == pytest.approx(whole.rms_height_difference_um, abs=1e-7)
-    assert not list((tmp_path / "disk").glob(".large-*"))
     # The record of the design has the same figures, but for the zero order.
     predicted = Design.read(design).predicted
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
 
-def test_displaced_write_fields_are_judged_alike_in_memory_and_from_disk(alone, tmp_path):
+def test_displaced_write_fields_are_judged_alike_in_one_piece_and_in_bands(alone, tmp_path):
     design, printer, stitch = alone / "design", large_rank.printer(), Stitching(field_um=4.0, sigma_um=0.15)
     loaded = load_design(design)
     plain = loaded.printed_um(printer)
     moved = in_fields(plain, 0.1, 40, stitch.offsets_um(SIZE, 0.1, [0]))
     wanted = loaded.score(moved).model_dump()
-    folders = (tmp_path / "disk", tmp_path / "whole")
+    folders = (tmp_path / "bands", tmp_path / "whole")
     (streamed,) = score(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
     for name, value in streamed.figures.items():
         # As without fields: rounding of waves, in figures that are sums of squares of them.
