@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.evaluation.tables import benchmark_verdict, evaluation_verdict
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import ModelScores, ScanRow
+from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
 _WORDS = Path(__file__).with_name("words.toml")
@@ -47,7 +47,7 @@ def write_evaluation_report(
         "Error and noise floor.",
     )
     page.paragraph(lock_box_text(result.split))
-    worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
+    worst = max(range(len(scans)), key=list(scores.leading_of_scans_nm.values()).__getitem__)
     shown = {scores.model: predictions_um[worst]}
     page.heading("The worst scan")
     page.figure(plots.residual_maps(scans[worst], shown, result.nuisance), "Measured height and error.")
@@ -74,7 +74,7 @@ def write_benchmark_report(
     out: str | Path,
 ) -> Path:
     """Render the result into ``out``; ``predictions_um`` is model name -> scan id -> height."""
-    scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
+    scores = sorted(result.scores, key=lambda s: -s.leading_nm)
     best = scores[-1]
     on_paper_data = result.dataset.name == _PAPER_DATASET
     page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=_WORDS)
@@ -107,7 +107,7 @@ def write_benchmark_report(
             "lock_box.csv",
         )
     page.heading("One scan", folded=True)
-    middle = _median_scan(best.scans)
+    middle = _median_scan(best)
     shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}
     page.figure(
         plots.residual_maps(scans[middle], shown, result.nuisance),
@@ -228,6 +228,6 @@ def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_lev
         page.paragraph(note)
 
 
-def _median_scan(rows: Sequence[ScanRow]) -> int:
-    errors = np.array([row.mae_datum_free_nm for row in rows])
+def _median_scan(score: ModelScores) -> int:
+    errors = np.array(list(score.leading_of_scans_nm.values()))
     return int(np.argsort(errors)[len(errors) // 2])

@@ -25,10 +25,13 @@ def headline_table(
 ) -> pd.DataFrame:
     """One row per model: both errors with intervals, what they have above the noise floor, spread and bias.
 
-    Below them the floor itself, under each column that of its own scan terms.
+    Below them the floor itself, under each column that of its own scan terms. Of films the errors of edges
+    and features.
     """
     import pandas as pd
 
+    if scores[0].seen_by == "sem":
+        return pd.DataFrame([_film_row(score) for score in scores])
     below = floor.at(protocol.policy)
     least = floor.mae_at(protocol.policy)
     rows = [
@@ -54,6 +57,20 @@ def headline_table(
         "scans": "",
     }
     return pd.DataFrame([*rows, known])
+
+
+def _film_row(score: ModelScores) -> dict[str, Any]:
+    return {
+        "model": score.model,
+        "edge_mean_nm": score.edge_mean_nm,
+        "edge_mean_ci95_nm": interval_text(score.edge_mean_ci95_nm),
+        "edge_p95_nm": score.edge_p95_nm,
+        **score.metrics,
+        "edge_unmatched": score.edge_unmatched,
+        "edge_unmatched_expected": score.edge_unmatched_expected,
+        "mae_abs_nm": score.mae_abs_nm,
+        "scans": len(score.scans),
+    }
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
@@ -82,7 +99,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: phase error, and all metrics of ``metric_registry``."""
-    keys = [metric.key for metric in registered_metrics()]
+    keys = [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
     return [
         {
             "model": s.model,
@@ -175,8 +192,8 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
             notes.append(
                 f"{s.model}: {s.dropped_pixels} pixels were not measured or not valid and are not scored."
             )
-    if scores:
-        s = min(scores, key=lambda entry: entry.mae_datum_free_nm)
+    if scores and scores[0].seen_by == "afm":
+        s = min(scores, key=lambda entry: entry.leading_nm)
         notes.append(
             f"Line offsets left by {s.model}: {s.row_offset_sd_nm:.1f} nm along the rows of the layout, "
             f"{s.scan_line_offset_sd_nm:.1f} nm along the scan's own lines. Offsets that follow the layout "
@@ -187,23 +204,26 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
 
 # What counts as more than chance: an interval without zero, and sign flips of the independent units below.
 _CHANCE = 0.05
+_OF = {"afm": "", "sem": " of the edges"}
 
 
 def benchmark_verdict(result: Benchmark) -> str:
     """Which model predicts best, by how much, whether that is more than chance, and what noise leaves."""
-    ranking = sorted(result.scores, key=lambda one: one.mae_datum_free_nm)
+    ranking = sorted(result.scores, key=lambda one: one.leading_nm)
     best, *others = ranking
     unit = "quadrants" if result.split.kind == "paper" else "scans"
     text = (
-        f"{best.model} is best at predicting {unit} it was not trained on: {best.mae_datum_free_nm:.2f} nm "
-        f"mean error over {len(best.scans)} {unit}. "
+        f"{best.model} is best at predicting {unit} it was not trained on: {best.leading_nm:.2f} nm "
+        f"mean error{_OF[best.seen_by]} over {len(best.scans)} {unit}. "
     )
     if others:
         second = others[0]
-        text += f"{second.model} is next with {second.mae_datum_free_nm:.2f} nm; "
+        text += f"{second.model} is next with {second.leading_nm:.2f} nm; "
         names = {best.model, second.model}
         pair = next((one for one in result.paired if {one.first, one.second} == names), None)
         text += "they were not compared scan by scan. " if pair is None else f"{chance_text(pair)}. "
+    if best.seen_by == "sem":
+        return text.rstrip()
     return text + _share_of_noise(result.noise_floor, best.mae_datum_free_nm, result.nuisance.policy)
 
 
@@ -212,6 +232,9 @@ def evaluation_verdict(result: Evaluation) -> str:
     scores = result.scores
     trained = len(result.trained_on_scored_scans)
     seen = f" ({trained} of which it was trained on)" if trained else ""
+    if scores.seen_by == "sem":
+        of_edges = f"its edges lie {scores.leading_nm:.2f} nm from the measured ones"
+        return f"{result.model.name}: {of_edges}, mean over {len(scores.scans)} scans{seen}."
     return (
         f"{result.model.name} is off by {scores.mae_abs_nm:.1f} nm over {len(scores.scans)} scans{seen} as "
         f"it stands, and by {scores.mae_datum_free_nm:.2f} nm once the scan's own terms are fitted. "

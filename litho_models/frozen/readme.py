@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import filled
+from litho_data.reports.page import filled
 
 if TYPE_CHECKING:
     from litho_models.frozen.card import ModelCard

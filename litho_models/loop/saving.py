@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from litho_data.foundation.report import filled
+from litho_data.reports.page import filled
 from litho_data.store import Store
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share

@@ -39,6 +39,16 @@ def policy_terms(policy: str) -> Terms:
     raise unknown_name("nuisance policy", policy, POLICIES)
 
 
+def usual_policy(film: bool) -> Policy:
+    """What scans are freed of unless one says otherwise: films have no zero height to lose."""
+    return "none" if film else "offset"
+
+
+def usual_background(film: bool) -> BackgroundUse:
+    """What is added to predictions unless one says otherwise."""
+    return "none" if film else "training"
+
+
 class NuisanceProtocol(Record):
     """What a scan may be freed of before it is scored, and on which pixels that was fitted.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
@@ -17,6 +19,8 @@ from litho_models.scoring.statistics import OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
+LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+"""The error by which models are ranked and compared, by the instrument."""
 
 
 class Prediction(NamedTuple):
@@ -118,6 +122,8 @@ class ModelScores(MetricValues):
 
     model: str
     scans: list[ScanRow]
+    seen_by: Instrument = "afm"
+    edge_mean_ci95_nm: Interval = None
     mae_abs_nm: float
     mae_abs_ci95_nm: Interval
     bias_nm: float
@@ -135,9 +141,26 @@ class ModelScores(MetricValues):
     dropped_pixels: int
     constant_predictions: int
 
+    @property
+    def leading_nm(self) -> float:
+        """The error that ranks models: of edges for films, of heights else; infinite without an edge."""
+        value = getattr(self, LEADING[self.seen_by])
+        return math.inf if value is None else float(value)
+
+    @property
+    def leading_ci95_nm(self) -> Interval:
+        """Its interval."""
+        return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
+
+    @property
+    def leading_of_scans_nm(self) -> dict[str, float]:
+        """The same of every scan by id; not a number where there is no edge."""
+        values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
+        return {scan: math.nan if value is None else value for scan, value in values.items()}
+
 
 class Paired(Record):
-    """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better.
+    """Mean over scans of first minus second leading error; negative means the first is better.
 
     ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
     """
@@ -153,12 +176,12 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the datum-free errors of the same scans, which meet by id: results list them by fold.
+    """Compare the leading errors of the same scans, which meet by id: results list them by fold.
 
     Raises:
         InputError: scores of different scans.
     """
-    errors = [{row.scan: row.mae_datum_free_nm for row in score.scans} for score in (first, second)]
+    errors = [score.leading_of_scans_nm for score in (first, second)]
     if errors[0].keys() != errors[1].keys():
         counts = " and ".join(str(len(found)) for found in errors)
         raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")

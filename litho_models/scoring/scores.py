@@ -61,6 +61,8 @@ def score_model(
     return ModelScores(
         model=name,
         scans=rows,
+        seen_by=scans[0].seen_by,
+        edge_mean_ci95_nm=interval([row.edge_mean_nm for row in rows if row.edge_mean_nm is not None]),
         **over_scans,
         by_policy=_policy_errors(freed),
         without_background=_policy_errors(freed_by_policy(scans, heights, blocks, bare)),

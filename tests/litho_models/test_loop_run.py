@@ -17,7 +17,7 @@ import tifffile
 import litho_data
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, open_store
-from litho_data.store.lock_box import lock_box, locked_ids
+from litho_data.store.lock_box import locked_ids
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
@@ -357,8 +357,6 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
 ) -> None:
     scans = make_scans(6, 48)
     locked = locked_ids(scans)
-    # Drawn with this seed, or from the scans that are left, the box would be another.
-    assert lock_box([s.id for s in scans], [s.print_id for s in scans], 1, seed=2) != locked
     # Hardly any pixel of the locked scan is measured, so it is dropped.
     corner = np.zeros(scans[0].shape, bool)
     corner[:4, :4] = True

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report_pictures import DARK, LIGHT, model_colour, svg_address
 from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
 
 if TYPE_CHECKING:
     import jinja2
@@ -26,31 +26,7 @@ if TYPE_CHECKING:
 # Column of a table to its name for people and what it is; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
-_UNITS = {
-    "per_um": "1/µm",
-    "um2": "µm²",
-    "deg": "°",
-    "um": "µm",
-    "nm": "nm",
-    "px": "px",
-    "mib": "MiB",
-    "db": "dB",
-    "s": "s",
-    "waves": "waves",
-}
-_SHORT = {"ci95": "95 % interval", "mae": "MAE", "rmse": "RMSE", "sd": "standard deviation", "psnr": "PSNR"}
-_SHORT |= {
-    "ssim": "SSIM",
-    "id": "scan",
-    "fwhm": "FWHM",
-    "mtf": "MTF",
-    "psf": "PSF",
-    "sha256": "SHA-256",
-    "k": "k",
-    "icc": "ICC",
-    "eff": "efficiency",
-    "si": "scale-invariant",
-}
+_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
 # Columns that hold keys, which are spelt out like the names of columns.
@@ -222,7 +198,7 @@ def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") ->
 def _template() -> jinja2.Template:
     import jinja2
 
-    text = Path(__file__).with_name("report_page.html.jinja").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("page.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True)
     environment.filters["whole_options"] = _whole_options
     return environment.from_string(text)
@@ -255,7 +231,7 @@ def capitalised(text: str) -> str:
 def spelt_out(key: str) -> str:
     """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:
-        return _SHORT.get(key, key)
+        return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")
     if more and "_" in head:
         return f"{spelt_out(head)}, {more}"
@@ -263,11 +239,11 @@ def spelt_out(key: str) -> str:
     if between:
         return f"{spelt_out(head)}, standard deviation between {more}"
     words, unit = key, ""
-    for suffix, text in _UNITS.items():
+    for suffix, text in _SPELT["units"].items():
         if key.endswith(f"_{suffix}"):
             words, unit = key.removesuffix(f"_{suffix}"), f" ({text})"
             break
-    return " ".join(_SHORT.get(word, word) for word in re.split("_+", words)) + unit
+    return " ".join(_SPELT["short"].get(word, word) for word in re.split("_+", words)) + unit
 
 
 def _text(value: Any, digits: int) -> str:
