@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_data.reports.paper import wanted, write_figures, write_table
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ class Page:
         known = tomllib.loads(words.read_text(encoding="utf-8")) if isinstance(words, Path) else words
         self._words: Words = known or {}
         self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
-        self._tables: list[tuple[str, pd.DataFrame]] = []
+        self._tables: list[tuple[str, pd.DataFrame, list[str], int]] = []
+        self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
         """Start a section; a folded one shows its heading only until it is opened."""
@@ -123,11 +125,13 @@ class Page:
         ]
         meanings = [(column["name"], column["meaning"]) for column in shown if column["meaning"]]
         self._add("table", caption=caption, csv=csv_name, columns=shown, rows=rows, meanings=meanings)
-        self._tables.append((csv_name, frame))
+        self._tables.append((csv_name, frame, [str(column["name"]) for column in shown], digits))
 
     def figure(self, figure: Figure, caption: str) -> None:
         """A matplotlib figure of :func:`new_figure`."""
         self._add("figure", caption=caption, address=svg_address(figure))
+        if wanted().figures:
+            self._figures.append(figure)
 
     def gallery(
         self, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[str, Sequence[str]]], caption: str
@@ -142,11 +146,13 @@ class Page:
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page and its CSV tables into ``folder``; returns the path of the page."""
+        """Write the page, its tables and what a paper takes into ``folder``; returns the path of the page."""
         target = Path(folder)
-        for csv_name, frame in self._tables:
+        for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
                 frame.to_csv(temporary, index=False)
+            write_table(frame.set_axis(names, axis=1), target / csv_name, digits)
+        write_figures(self._figures, target)
         run = self._run or RunFacts(**run_facts())
         commit = run.commit + (" with changes" if run.dirty else "")
         facts = self._facts | ({"commit": commit} if commit else {}) | run.versions

@@ -12,6 +12,7 @@ import typer
 
 from litho_data.commands.app import DaskOption, WorkersOption
 from litho_data.commands.settings import changed
+from litho_data.reports.paper import with_paper_copies
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -216,6 +217,7 @@ def lens(
     _print_design(design, out)
 
 
+@with_paper_copies
 @takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
 def compare(
     models: Annotated[

@@ -13,6 +13,7 @@ from litho_data.commands.app import DaskOption, WorkersOption, new_app, run_app,
 from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.reports.paper import with_paper_copies
 from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
@@ -120,6 +121,7 @@ def train(
 
 
 @app.command()
+@with_paper_copies
 def evaluate(
     model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
     store: StorePath,
@@ -169,6 +171,7 @@ def evaluate(
 
 @app.command()
 @with_further_options
+@with_paper_copies
 def benchmark(
     store: StorePath,
     out: Out,

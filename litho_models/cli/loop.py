@@ -9,8 +9,10 @@ import typer
 
 import litho_models
 from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.reports.paper import with_paper_copies
 
 
+@with_paper_copies
 def close_loop(
     stores: Annotated[
         list[Path],

@@ -1,0 +1,118 @@
+"""Figures and tables of a report once more, as a paper takes them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from litho_data.commands.app import option, takes
+from litho_data.foundation.files import atomic_file
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+Figures = Literal["pdf", "svg", "png"]
+Tables = Literal["csv", "latex", "markdown"]
+
+# One column and two of a page of two columns.
+_COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
+# What is wider than this on the screen is not legible in one column.
+_WIDE_INCH = 8.0
+_FONT_PT, _DPI = 7.0, 300
+_ENDINGS = {"latex": ".tex", "markdown": ".md"}
+
+
+@dataclass(frozen=True)
+class PaperCopies:
+    """What is written beside a report: figures in one format, tables in one beside CSV."""
+
+    figures: Figures | None = None
+    tables: Tables = "csv"
+
+
+_WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=None)
+
+
+@contextmanager
+def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
+    """Reports that are written inside also write their figures and tables for a paper."""
+    token = _WANTED.set(PaperCopies(figures, tables))
+    try:
+        yield
+    finally:
+        _WANTED.reset(token)
+
+
+def wanted() -> PaperCopies:
+    """What is asked for where this is called."""
+    return _WANTED.get() or PaperCopies()
+
+
+def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that writes a report ``--figures`` and ``--tables``."""
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        with paper_copies(values.pop("figures"), values.pop("tables")):
+            command(**values)
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    figures = Annotated[Figures | None, option("also write the figures, in the widths of a paper's columns")]
+    tables = Annotated[Tables, option("what the tables are written as, beside CSV")]
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    shown = [
+        *(one.replace(kind=kind) for one in own),
+        inspect.Parameter("figures", kind, default=None, annotation=figures),
+        inspect.Parameter("tables", kind, default="csv", annotation=tables),
+    ]
+    return takes(run, shown)
+
+
+def write_figures(figures: Sequence[Figure], folder: Path) -> None:
+    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; they are changed."""
+    import matplotlib
+    from matplotlib.text import Text
+
+    ending = wanted().figures
+    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "path"}):
+        for number, figure in enumerate(figures, 1):
+            width, height = figure.get_size_inches()
+            column = _PAGE_INCH if width > _WIDE_INCH else _COLUMN_INCH
+            figure.set_size_inches(column, height * column / width)
+            for text in figure.findobj(Text):
+                text.set_fontsize(_FONT_PT)
+            with atomic_file(folder / f"figure-{number}.{ending}") as temporary:
+                figure.savefig(temporary, format=ending, dpi=_DPI)
+
+
+def write_table(frame: pd.DataFrame, csv_path: Path, digits: int) -> None:
+    """Write a table as asked for, beside its CSV file: full precision there, ``digits`` places here."""
+    if wanted().tables == "csv":
+        return
+    with atomic_file(csv_path.with_suffix(_ENDINGS[wanted().tables])) as temporary:
+        temporary.write_text(_TEXTS[wanted().tables](frame, digits), encoding="utf-8")
+
+
+def _latex(frame: pd.DataFrame, digits: int) -> str:
+    return frame.to_latex(index=False, escape=True, float_format=f"%.{digits}f", na_rep="–")
+
+
+def _markdown(frame: pd.DataFrame, digits: int) -> str:
+    def cell(value: object) -> str:
+        if value is None or value != value:
+            return "–"
+        return f"{value:.{digits}f}" if isinstance(value, float) else str(value).replace("|", r"\|")
+
+    rows = [map(cell, frame.columns), ["---"] * len(frame.columns)]
+    rows += [map(cell, row) for row in frame.itertuples(index=False)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+_TEXTS: dict[str, Callable[[pd.DataFrame, int], str]] = {"latex": _latex, "markdown": _markdown}
