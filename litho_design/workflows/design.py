@@ -260,7 +260,7 @@ def _designed(
     printer = load_printer(model, layout, **fit)
     others = list(load_printers(ensemble, layout, **fit).values())
     rivals = (
-        models_at_hand([printer, *others], layout, device=device)
+        models_at_hand([one.record() for one in (printer, *others)], layout, device=device)
         if judges is None
         else list(load_printers(judges, layout, **fit).values())
     )
