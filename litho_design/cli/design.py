@@ -52,10 +52,6 @@ SpreadOf = Annotated[
         hidden=True,
     ),
 ]
-Ensemble = Annotated[
-    list[str] | None,
-    typer.Option(help="NAME=MODEL of a further model in the loss; repeatable", hidden=True),
-]
 Judges = Annotated[
     list[str] | None,
     typer.Option(
@@ -110,7 +106,6 @@ def hoe(
     given: Given,
     target: Target = "text",
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
@@ -135,7 +130,7 @@ def hoe(
     from litho_design.workflows.design import design_hologram
 
     design = design_hologram(
-        target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
+        target, model, out, settings=settings, judges=judge, robust=robust,
         band_px=band_px if large else None, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     if not large or Ranks.joined().rank == 0:
@@ -161,7 +156,6 @@ def correct(
     scan_levelling: ScanLevelling = "bow",
     scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = True,
     device: Device = "cpu",
@@ -178,7 +172,7 @@ def correct(
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
-        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
+        judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -191,7 +185,6 @@ def lens(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
@@ -210,7 +203,7 @@ def lens(
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), judges=judge, robust=robust, tile_px=band_px if large else None,
+        judges=judge, robust=robust, tile_px=band_px if large else None,
         device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
