@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data import open_store
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import model_colour, new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import model_colour, new_figure
 from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder

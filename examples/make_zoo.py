@@ -16,7 +16,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.evaluation.results import Benchmark

@@ -85,7 +85,7 @@ FAULTS = [
           "        old.replace(target)\n    shutil", "        pass\n    shutil",
           f"{BEGUN} tests/litho_data/test_files.py"),
     Fault("leftovers stay", "litho_data/foundation/begun.py", "clear_leftovers(folder)", "pass", BEGUN),
-    Fault("a dead worker takes all jobs with it", "litho_data/foundation/workers.py",
+    Fault("a dead worker takes all jobs with it", "litho_data/sharing/workers.py",
           "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
 ]  # fmt: skip
 

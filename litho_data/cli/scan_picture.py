@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.kinds import Array
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 from litho_data.scan import Scan
 
 _COLOURS = "viridis"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from litho_data.cli.scan import ChannelName, Format, FullScale, Missing, Size, Unit, marks
-from litho_data.foundation.app import argument, option
+from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 
 if TYPE_CHECKING:

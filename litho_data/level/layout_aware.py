@@ -13,6 +13,7 @@ from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.register.topography import smooth_measured
 
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
@@ -63,13 +64,16 @@ def level_layout_aware(
     if not terms:
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
     blurs = _BLURS_PX if blur_px is None else (blur_px,)
-    inside = _inside(np.isfinite(layout_level), 2 * blurs[-1])
+    known = np.isfinite(layout_level)
+    inside = _inside(known, 2 * blurs[-1])
     chosen = select(z, mask, masking)
     fitted = inside if chosen is None else chosen & inside
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
     level = np.asarray(layout_level, dtype=float)
-    fits = [_joint_fit(z, _blur(level, blur), fitted, terms) for blur in blurs]
+    fits = [
+        _joint_fit(z, np.where(known, smooth_measured(level, blur), np.nan), fitted, terms) for blur in blurs
+    ]
     surface = evaluate(min(fits, key=lambda fit: fit[1])[0], z.shape)
     return subtract(z, surface - surface[fitted].mean())
 
@@ -113,16 +117,6 @@ def layout_in_scan_frame(
     levels = np.full(scan_shape, np.nan)
     levels[inside] = layout_level[row[inside], column[inside]]
     return levels
-
-
-def _blur(level: Array, sigma_px: float) -> Array:
-    """Gaussian blur over the known pixels only; unknown ones stay unknown."""
-    if sigma_px == 0:
-        return level
-    known = np.isfinite(level)
-    weight = ndimage.gaussian_filter(known.astype(float), sigma_px)
-    spread = ndimage.gaussian_filter(np.where(known, level, 0.0), sigma_px)
-    return np.where(known, spread / np.where(weight > 0, weight, 1.0), np.nan)
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:

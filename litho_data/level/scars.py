@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy import ndimage, sparse
-from scipy.sparse import linalg
+from scipy import ndimage
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -111,27 +110,16 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Values of the unknown pixels, in the order of ``z[unknown]``."""
-    n = int(np.count_nonzero(unknown))
-    index = np.full(z.shape, -1)
-    index[unknown] = np.arange(n)
-    known = np.isfinite(z) & ~unknown
-    coupling, right, anchors = np.zeros(n), np.zeros(n), np.zeros(n)
-    pairs = []
-    every, first, last = slice(None), slice(None, -1), slice(1, None)
-    for here, there in (((first, every), (last, every)), ((every, first), (every, last))):
-        for a, b in ((here, there), (there, here)):
-            inside, border = unknown[a] & unknown[b], unknown[a] & known[b]
-            pairs.append((index[a][inside], index[b][inside]))
-            np.add.at(coupling, index[a][inside], 1.0)
-            np.add.at(anchors, index[a][border], 1.0)
-            np.add.at(right, index[a][border], z[b][border])
-    labels, count = ndimage.label(unknown)
-    anchored = np.bincount(labels[unknown], weights=anchors, minlength=count + 1)[1:]
-    if (anchored == 0).any():
+    """Values of the unknown pixels, in the order of ``z[unknown]``; what was not measured is filled along."""
+    from SurfaceTopography import Topography
+
+    left_out = unknown | ~np.isfinite(z)
+    areas, _ = ndimage.label(left_out)
+    beside = ndimage.binary_dilation(~left_out)
+    if set(np.unique(areas[unknown])) - set(np.unique(areas[beside & left_out])):
         raise InputError(
             "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
         )
-    rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    links = sparse.csc_matrix((-np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    return linalg.spsolve(links + sparse.diags(coupling + anchors, format="csc"), right)
+    known = Topography(np.ma.masked_array(z, left_out), z.shape)
+    filled: Array = known.interpolate_undefined_data_with_harmonic_function().heights()
+    return filled[unknown]

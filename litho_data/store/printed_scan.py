@@ -75,7 +75,7 @@ class PrintedScan:
         )
 
     def _repr_html_(self) -> str:
-        from litho_data.foundation.report_pictures import shown_html
+        from litho_data.reports.pictures import shown_html
 
         return shown_html(repr(self), layout_um=self.layout_um, height_um=self.height_um)
 

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from litho_data.cards.card import load_card
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.foundation.kinds import Shape

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from litho_data.foundation.app import new_app, run_app, with_further_options
+from litho_data.commands.app import new_app, run_app, with_further_options
+from litho_data.commands.settings import changed
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import changed
 from litho_design.cli.design import compare, correct, first, hoe, lens, settings
 from litho_design.cli.options import (
     BandPx,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from litho_data.foundation.app import DaskOption, WorkersOption
-from litho_data.foundation.settings import changed
+from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.commands.settings import changed
 from litho_design.cli.options import (
     BandPx,
     Device,

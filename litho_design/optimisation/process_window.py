@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import ConfigDict
 
+from litho_data.commands.settings import leaves, setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
 from litho_design.optimisation.stitching import Stitching
 

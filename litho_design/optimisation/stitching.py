@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 
 if TYPE_CHECKING:
     from torch import Tensor

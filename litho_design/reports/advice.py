@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any
 
-from litho_data.foundation.report import Words, spelt_out
+from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
 # Figures whose key, spelt out, says too little; what each is, the descriptions of the scores say.

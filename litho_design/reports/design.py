@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
+from litho_data.reports.page import Page, capitalised
 from litho_design.holograms.bench import HologramScore
 from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
 from litho_design.judging.loaded import LoadedDesign, task_named

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.score import mtf
 from litho_design.tasks.design import Design

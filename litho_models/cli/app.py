@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
+from litho_data.commands.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
+from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import assigned
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import DaskOption, WorkersOption
+from litho_data.commands.app import DaskOption, WorkersOption
 
 
 def close_loop(

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.commands.progress import progress, say_estimate
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import progress, say_estimate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256

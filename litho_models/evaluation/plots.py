@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import LIGHT, model_colour, new_figure
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.reports.pictures import LIGHT, model_colour, new_figure
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ModelScores

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import RoundRecord

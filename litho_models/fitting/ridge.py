@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
 from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights

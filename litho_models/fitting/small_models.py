@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Problem, Room, Rules, fit_least_squares

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan

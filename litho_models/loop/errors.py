@@ -9,7 +9,7 @@ import numpy as np
 from torch import nn
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.foundation.workers import run_jobs
+from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed, fit_with_measurement, held_out_maps
 from litho_models.loop.fits import State, Study, fit_state, prepared_among

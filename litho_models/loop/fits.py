@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.foundation.workers import HERE, Workers
+from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
 from litho_models.loop.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
 from litho_models.scan_terms.groups import ALL
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from litho_data.foundation.workers import run_jobs
+from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.commands.progress import say
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import Store, open_store

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 from litho_models.monitoring.prints import print_values
 from litho_models.monitoring.result import Check, FigureCheck
 from litho_models.monitoring.wording import figure_of

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.report import capitalised
+from litho_data.reports.page import capitalised
 from litho_models.monitoring.change_point import SOON
 from litho_models.monitoring.prints import FIGURES, Figure, in_order
 from litho_models.monitoring.result import FigureCheck

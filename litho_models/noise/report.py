@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_models.evaluation.tables import interval_text
 from litho_models.noise import plots
 from litho_models.noise.budget import NoiseBudget

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint
 from litho_models.planning.rivalry import PlannedPrint, Rivalry

@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from benchmarks.blind_trials import campaign
-from litho_data.build.build import build_dataset
-from litho_data.foundation import workers as module
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import running_command
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.making.build import build_dataset
+from litho_data.sharing import workers as module
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.store import open_store
 from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
@@ -111,8 +111,8 @@ def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: P
             yield one
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("litho_data.build.build.run_jobs", and_kill)
-        patched.setattr("litho_data.build.build.write_report", lambda *_: None)
+        patched.setattr("litho_data.making.build.run_jobs", and_kill)
+        patched.setattr("litho_data.making.build.write_report", lambda *_: None)
         result = build_dataset(card, tmp_path / "prints.zarr", dask=address)
     assert killed
     assert result.dataset.sha256 == alone.dataset.sha256

@@ -13,10 +13,10 @@ import zarr
 from scipy.ndimage import gaussian_filter
 
 from litho_data import build_dataset, open_store
-from litho_data.build.contour import coverage, find_edges, foreign
 from litho_data.cards.card import check_card
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
+from litho_data.making.contour import coverage, find_edges, foreign
 from litho_data.provenance.verify import verify
 
 RADIUS_PX = 60.0

@@ -11,10 +11,10 @@ import pytest
 import scipy.ndimage
 from typer.testing import CliRunner
 
-from litho_data.build.build import build_dataset
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level.scan import write_heights
+from litho_data.making.build import build_dataset
 from litho_data.provenance.history import replay
 from litho_data.provenance.verify import verify
 from litho_data.scan import Scan

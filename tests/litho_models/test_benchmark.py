@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 import zarr
 
-from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.schema import DatasetId

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.build.right_layout import Print
 from litho_data.cards.card import Card
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_data.making.right_layout import Print
 
 ALL = "all scans"
 # So many times the height that the layout says, or that the other prints have: a number is wrong.

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from litho_data.build.jobs import FieldJob, field_jobs, scaled_pitch_um
-from litho_data.build.operations import OPERATIONS, load_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.kinds import Array
 from litho_data.level.recipe import Recipe
+from litho_data.making.jobs import FieldJob, field_jobs, scaled_pitch_um
+from litho_data.making.operations import OPERATIONS, load_recipe
 
 if TYPE_CHECKING:
-    from litho_data.foundation.report import Page
+    from litho_data.reports.page import Page
 
 RECIPES: dict[str, str] = {
     "plane": """[[step]]
@@ -195,7 +195,7 @@ def _write_card(card: Path, best: str) -> Path:
 
 
 def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:
-    from litho_data.foundation.report import Page
+    from litho_data.reports.page import Page
 
     page = Page(
         "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
@@ -213,7 +213,7 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
 
 
 def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
-    from litho_data.foundation.report_pictures import colour_bar_png, coloured_png, thumbnail
+    from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
 
     rows, bar = [], colour_bar_png("cividis")
     for name, images in pictures.items():

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any, ClassVar
 
-from litho_data.build.verdict import Finding
 from litho_data.foundation.results import Record, Result
+from litho_data.making.verdict import Finding
 from litho_data.store.schema import DatasetId
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.build.step import Facts, Files, Function, Inputs, Made, Operation, Params
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
+from litho_data.making.step import Facts, Files, Function, Inputs, Made, Operation, Params
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
@@ -35,7 +35,7 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
     def made(function: Function) -> Function:
         OPERATIONS[name] = Operation(
-            name, "1", function, tuple(takes.split()), (*code, "build/operations.py")
+            name, "1", function, tuple(takes.split()), (*code, "making/operations.py")
         )
         return function
 
@@ -101,10 +101,10 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
     return {"micrograph": grey.astype(np.uint16)}, {**facts, "header": {}}
 
 
-@_operation("find-edges", "micrograph", "build/contour.py")
+@_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     """Edges of the film; the height that they stand for is what is registered."""
-    from litho_data.build.contour import coverage, find_edges
+    from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
     height = params["film_um"] * coverage(edges.distance_px, 1.0)
@@ -114,11 +114,11 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 @_operation(
-    "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "build/contour.py"
+    "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     """The film on the layout's grid: its height times the share of a pixel that it covers, without dirt."""
-    from litho_data.build.contour import coverage, foreign
+    from litho_data.making.contour import coverage, foreign
     from litho_data.register.refine import interior_of
 
     distance, valid = _on_layout(arrays["edge_distance_um"], params, arrays)
@@ -136,10 +136,10 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     return {**made, "valid": valid}, {"dirt_share": float(dirt.mean())}
 
 
-@_operation("calibrate", "", "readers", "roughness", "build/calibration.py")
+@_operation("calibrate", "", "readers", "roughness", "making/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     """Scales of the microscope, from scans of what has a known size."""
-    from litho_data.build.calibration import SCALES, measure_scales
+    from litho_data.making.calibration import SCALES, measure_scales
 
     found = measure_scales(params["standards"], files)
     facts: Facts = {}
@@ -271,10 +271,10 @@ def _on_layout(scan_map: Array, params: Params, arrays: Inputs) -> tuple[Array, 
     "levelled_height_um height_um mask_level calibration",
     "register",
     "roughness",
-    "build/height_sigma.py",
+    "making/height_sigma.py",
 )
 def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.build.height_sigma import height_sigma
+    from litho_data.making.height_sigma import height_sigma
 
     sigma_um, budget = height_sigma(
         arrays["levelled_height_um"],

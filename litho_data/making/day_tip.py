@@ -4,9 +4,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
-from litho_data.build.jobs import FieldJob, scaled_pitch_um
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.making.jobs import FieldJob, scaled_pitch_um
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 

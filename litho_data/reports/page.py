@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report_pictures import DARK, LIGHT, model_colour, svg_address
 from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
 
 if TYPE_CHECKING:
     import jinja2
@@ -201,7 +201,7 @@ def _frame(table: Table) -> pd.DataFrame:
 def _template() -> jinja2.Template:
     import jinja2
 
-    text = Path(__file__).with_name("report_page.html.jinja").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("page.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True)
     environment.filters["whole_options"] = _whole_options
     return environment.from_string(text)

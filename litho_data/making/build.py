@@ -11,21 +11,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.assemble import Source, assemble, records_of_use
-from litho_data.build.calibration import measure_scales, standards_of
-from litho_data.build.day_tip import with_tip_found
-from litho_data.build.jobs import FieldJob, Job, Skipped, field_jobs, finish
-from litho_data.build.operations import UNREGISTERED, load_recipe, no_recipe
-from litho_data.build.report import write_report
-from litho_data.build.result import BuildResult, LeftOut, report_folder
-from litho_data.build.right_layout import doubts, fitting_layout, prints_of
-from litho_data.build.verdict import Weight, findings, odd_heights, require_heights
 from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
-from litho_data.foundation.commands import progress, say
+from litho_data.commands.progress import progress, say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import software_record
-from litho_data.foundation.workers import HERE, Workers, run_jobs
+from litho_data.making.assemble import Source, assemble, records_of_use
+from litho_data.making.calibration import measure_scales, standards_of
+from litho_data.making.day_tip import with_tip_found
+from litho_data.making.jobs import FieldJob, Job, Skipped, field_jobs, finish
+from litho_data.making.operations import UNREGISTERED, load_recipe, no_recipe
+from litho_data.making.report import write_report
+from litho_data.making.result import BuildResult, LeftOut, report_folder
+from litho_data.making.right_layout import doubts, fitting_layout, prints_of
+from litho_data.making.verdict import Weight, findings, odd_heights, require_heights
+from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.build.gratings import GratingScan, grating_scans
-from litho_data.build.verdict import verdict_of
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.kinds import Array
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import colour_bar_png, coloured_png, thumbnail
+from litho_data.making.gratings import GratingScan, grating_scans
+from litho_data.making.verdict import verdict_of
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_data.build.result import BuildResult
+    from litho_data.making.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
 # Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
@@ -53,9 +53,6 @@ _TABLE: dict[str, tuple[str, str]] = {
     "rotation_deg": ("rotation (°)", "angle of the scan on its layout, in its middle"),
     "singular_min": ("scale, smallest", "stretch of the scan along the direction with the least; 1 is none"),
     "singular_max": ("scale, largest", "stretch along the direction with the most"),
-    "noise_x_nm": ("noise along x (nm)", "noise of pixels, from differences along x"),
-    "noise_y_nm": ("noise along y (nm)", "noise of pixels, from differences along y"),
-    "row_step_nm": ("row steps (nm)", "standard deviation of the steps from one line to the next"),
     "removed_sd_nm": (
         "removed by levelling, sd (nm)",
         "standard deviation of the surface that levelling removed",

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from litho_data.build.jobs import Job
-from litho_data.build.operations import READERS, no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
+from litho_data.making.jobs import Job
+from litho_data.making.operations import READERS, no_recipe
 from litho_data.store.partial import outputs_of
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
 from litho_data.store.write import SHOWN, consolidate, write_samples, write_table

@@ -24,7 +24,7 @@ from typing import NamedTuple, TypeVar
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts, software_record
-from litho_data.foundation.sending import Away, Known, received, sent
+from litho_data.sharing.sending import Away, Known, received, sent
 
 J = TypeVar("J")
 R = TypeVar("R")

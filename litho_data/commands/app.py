@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from litho_data.foundation.commands import command_line, given_words
+from litho_data.commands.progress import command_line, given_words
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.run_facts import running_command
 

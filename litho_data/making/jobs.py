@@ -8,16 +8,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
-from litho_data.build.operations import OPERATIONS, READERS
-from litho_data.build.quality import levelling_figures, noise_figures
-from litho_data.build.step import Done
+import numpy as np
+
 from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
+from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
+from litho_data.making.operations import OPERATIONS, READERS
+from litho_data.making.step import Done
 from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
@@ -142,8 +143,10 @@ class FieldJob:
         notes = [*read.get("notes", ()), *facts.get("level", {}).get("notes", ())]
         said = (quality.get("warning", ""), *notes)
         quality["warning"] = "; ".join(filter(None, said))
-        if "raw_height_um" in arrays:
-            quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
+        if "removed_um" in arrays:
+            removed_nm = 1e3 * arrays["removed_um"].astype(float)
+            quality["removed_range_nm"] = float(np.nanmax(removed_nm) - np.nanmin(removed_nm))
+            quality["removed_sd_nm"] = float(np.nanstd(removed_nm))
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
         record = {
