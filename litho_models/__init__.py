@@ -26,26 +26,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "FrozenSimulator": "litho_models.frozen.simulator",
-            "PatchDataset": "litho_models.fitting.patches",
-            "Simulator": "litho_models.simulator",
-            "analyse_noise": "litho_models.noise",
-            "benchmark": "litho_models.evaluation.benchmark",
-            "build_model": "litho_models.models",
-            "close_loop": "litho_models.planning.rounds",
-            "compare": "litho_models.evaluation.compare",
-            "evaluate": "litho_models.evaluation.evaluate",
-            "freeze": "litho_models.frozen.freezing",
-            "load_frozen": "litho_models.frozen.files",
-            "model_of_authors": "litho_models.models.authors",
-            "register_effect": "litho_models.effects",
-            "register_metric": "litho_models.scoring.metric_registry",
-            "register_scan_term": "litho_models.scan_terms",
-            "save_frozen": "litho_models.frozen.files",
-            "train": "litho_models.fitting.runs",
-            "zoo": "litho_models.frozen",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

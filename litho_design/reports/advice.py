@@ -77,13 +77,14 @@ def width_sentence(design: Design) -> str:
         return ""
     by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
     text = spread_sentence(width.figure, by_model, width.less, width.gain)
+    text += f" The search used {width.searched_with} of them."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
             f" They differ most about level {level} ({low_um:.3f} to {high_um:.3f} µm): a print with wide "
             "fields of it would decide (litho-models next-print)."
         )
-    return f"{width.searched_with} of the models took part in the search. {text}"
+    return text
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
