@@ -6,8 +6,7 @@ from itertools import combinations
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from litho_models.scoring.pairs import paired_scores
-from litho_models.scoring.records import ModelScores
+from litho_models.scoring.records import ModelScores, paired_scores
 
 _FREE = {
     "none": "nothing",

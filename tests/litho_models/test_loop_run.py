@@ -34,7 +34,7 @@ from litho_models.loop.results import _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, dealt
 from litho_models.loop.saving import save_model
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
 
@@ -158,6 +158,8 @@ def _same_columns(table: pd.DataFrame, rows: list[dict[str, object]]) -> None:
             wanted = row[str(column)]
             if isinstance(wanted, float):
                 assert found == pytest.approx(wanted, rel=1e-12), column
+            elif isinstance(wanted, tuple):
+                assert found == " … ".join(f"{end:.2f}" for end in wanted), column
             elif wanted is None or wanted == "":
                 assert pd.isna(found), column
             else:
