@@ -7,8 +7,8 @@ from litho_data.foundation.faces import lazy_face
 if TYPE_CHECKING:
     from litho_models.effects import register_effect as register_effect
     from litho_models.evaluation.benchmark import benchmark as benchmark
-    from litho_models.evaluation.compare import compare as compare
     from litho_models.evaluation.evaluate import evaluate as evaluate
+    from litho_models.evaluation.results import compare as compare
     from litho_models.fitting.patches import PatchDataset as PatchDataset
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
