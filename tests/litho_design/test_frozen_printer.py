@@ -154,7 +154,8 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
 def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path):
     """And says how far they are apart: as stated, in the median and at worst."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
-    settings = hologram_settings(changes=changes | {"search.polish_rounds": 0, "window.yield_draws": 2})
+    few = {"search.polish_rounds": 0, "window.yield_draws": 2, "window.defocus_sd_um": 0.5}
+    settings = hologram_settings(changes=changes | few)
     known = {"judges": (), "announce": False}
     design = design_hologram("ring", "zoo:physics", tmp_path / "design", settings=settings, **known)
     result = score(tmp_path / "design", tmp_path / "score")
