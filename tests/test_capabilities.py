@@ -86,7 +86,7 @@ def public_names() -> set[str]:
             if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
                 names |= {f"{room}.{name}" for name in ast.literal_eval(node.value)}
             elif isinstance(node, ast.ImportFrom):
-                names |= {f"{room}.{alias.asname}" for alias in node.names if alias.asname}
+                names |= {f"{room}.{alias.name}" for alias in node.names if alias.asname == alias.name}
     return {name for name in names if name.rpartition(".")[0] not in INNER}
 
 
