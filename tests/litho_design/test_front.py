@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from litho_design import design_hologram, hologram_settings
 from litho_design.cli.app import main
 from litho_design.holograms.loss import HologramLoss, counted_pixels, hologram_loss
 from litho_design.judging.front import FrontResult
+from litho_design.workflows import front
 from litho_design.workflows.front import efficiency_front
 
 TINY = {
@@ -44,6 +46,20 @@ def test_the_front_trades_efficiency_for_likeness(tmp_path, monkeypatch, capsys)
     assert "efficiency_weight" in (tmp_path / "front.csv").read_text()
     with pytest.raises(InputError, match="two or more"):
         efficiency_front("ring", "none", tmp_path / "other", weights=(0.1, 0.1))
+
+
+def test_a_point_is_on_the_front_unless_another_is_as_good_in_both_figures(tmp_path, monkeypatch):
+    figures = {0.0: (20.0, 0.1), 0.1: (18.0, 0.3), 1.0: (17.0, 0.2), 3.0: (12.0, 0.3)}
+
+    def made(function, jobs, *given, **named):
+        for job in jobs:
+            psnr, share = figures[job[0]]
+            yield job, SimpleNamespace(predicted={"si_psnr_db": psnr, "eff_signal": share}, baselines=None)
+
+    monkeypatch.setattr(front, "run_jobs", made)
+    monkeypatch.setattr(front, "write_front_report", lambda *given: None)
+    points = efficiency_front("ring", "none", tmp_path, weights=list(figures)).points
+    assert [point.on_front for point in points] == [True, True, False, False]
 
 
 def test_light_beyond_the_signal_window_is_free():
