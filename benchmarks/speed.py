@@ -30,7 +30,7 @@ from torch import Tensor
 
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.side_by_side import PLAIN, Arrays, Comparison, Work, parser, relative_percent, run
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings, hologram_settings

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
-    from litho_data.build.build import build_dataset as build_dataset
     from litho_data.cards.fetch import fetch as fetch
     from litho_data.foundation.errors import InputError as InputError
     from litho_data.level.recipe import Recipe as Recipe
     from litho_data.level.scan import level_scan as level_scan
+    from litho_data.making.build import build_dataset as build_dataset
     from litho_data.provenance.verify import verify as verify
     from litho_data.readers.layout import read_layout as read_layout
     from litho_data.readers.read import read_scan as read_scan
@@ -36,7 +36,7 @@ else:
             "Recipe": "litho_data.level.recipe",
             "Scan": "litho_data.scan",
             "Store": "litho_data.store.read",
-            "build_dataset": "litho_data.build.build",
+            "build_dataset": "litho_data.making.build",
             "fetch": "litho_data.cards.fetch",
             "level_scan": "litho_data.level.scan",
             "open_store": "litho_data.store.read",

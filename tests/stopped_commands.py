@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.build import build_dataset
 from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.layouts import write_layout_set
+from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.virtual_fab import simulate
@@ -45,7 +45,7 @@ from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import make_scans, write_store

@@ -34,7 +34,7 @@ def require_tables_equal_record(
             rows = list(csv.DictReader(stream))
         assert rows, f"{file.name} is empty"
         own = {column: named.get(column, column) for column in rows[0]}
-        own = {column: field for column, field in own.items() if field}
+        own = {column: field for column, field in own.items() if field and any(row[column] for row in rows)}
         unknown = sorted(set(own.values()) - fields)
         assert not unknown, f"{file.name}: {unknown} are no fields of {record}"
         for number, row in enumerate(rows):
@@ -50,7 +50,7 @@ def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
         for one in value:
             yield from _objects(one, above)
     elif isinstance(value, dict):
-        plain = {name: one for name, one in value.items() if not isinstance(one, dict)}
+        plain = dict(_flat(value))
         own = {**above, **plain}
         yield own
         parts = {name: one for name, one in value.items() if isinstance(one, dict | list)}
@@ -59,6 +59,15 @@ def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
             # A mapping of names to objects, and the objects of two parts side by side.
             if isinstance(part, dict) and all(not isinstance(one, dict | list) for one in part.values()):
                 yield {**own, **part}
+
+
+def _flat(value: Mapping[str, Any], of: str = "") -> Iterator[tuple[str, Any]]:
+    """Fields with those of inner objects, whose names begin with their own."""
+    for name, one in value.items():
+        if isinstance(one, dict):
+            yield from _flat(one, f"{of}{name}_")
+        else:
+            yield f"{of}{name}", one
 
 
 def _agrees(one: Mapping[str, Any], stated: Mapping[str, str]) -> bool:

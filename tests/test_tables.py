@@ -66,7 +66,7 @@ def test_the_interval_at_a_bar_is_that_of_its_error() -> None:
         [one for one in axes.containers if type(one).__name__ == name]
         for name in ("BarContainer", "ErrorbarContainer")
     )
-    for kind, drawn, shown in zip(("mae_abs", "mae_datum_free"), bars, intervals, strict=True):
+    for kind, drawn, shown in zip(("mae_abs", "leading"), bars, intervals, strict=True):
         assert [one.get_width() for one in drawn] == [getattr(one, f"{kind}_nm") for one in scores]
         (lines,) = shown.lines[2]
         ends = np.array([segment[:, 0] for segment in lines.get_segments()])

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from litho_data.foundation.app import new_app, run_app, with_further_options
+from litho_data.commands.app import new_app, run_app, with_further_options
+from litho_data.commands.settings import changed
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import changed
-from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
+from litho_design.cli.design import compare, correct, first, hoe, lens, settings
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -34,7 +34,6 @@ app.command()(hoe)
 app.command()(lens)
 app.command()(correct)
 app.command()(compare)
-app.command()(estimate)
 app.command()(settings)
 
 
@@ -119,9 +118,7 @@ def score(
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option(
-            "--stream", help="hologram of any size: printed and scored band by band, the rest on disk"
-        ),
+        typer.Option("--stream", help="large hologram: printed and scored band by band"),
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 from litho_data.foundation.units import NM_PER_UM
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
+from litho_data.commands.settings import changed, setting
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
 from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-from litho_data.foundation.report import Words, spelt_out
+from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
 # Figures whose key, spelt out, says too little; what each is, the descriptions of the scores say.
@@ -25,8 +24,6 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures whose loss is told in dB: already in dB (0), shares of power (10).
-_IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10}
 # Figures that a score is told by, where it has them: what is said, decimals, and a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
@@ -69,29 +66,7 @@ def distribution_warning(design: Design) -> str:
         "have to change level to match them, and the prediction is an extrapolation"
     )
     text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
-    return text + _cost_of_staying_inside(design)
-
-
-def _cost_of_staying_inside(design: Design) -> str:
-    """What a layout closer to the training layouts scores, in dB where that makes sense; or nothing."""
-    gauge = design.out_of_distribution
-    if gauge is None or gauge.inside is None or gauge.inside_distance is None:
-        return ""
-    told = []
-    for name, scale in _IN_DB.items():
-        now, then = design.predicted.get(name, 0.0), gauge.inside.get(name, 0.0)
-        if min(now, then) > 0:
-            lost = now - then if scale == 0 else scale * math.log10(now / then)
-            more = "less" if lost >= 0 else "more"
-            told.append(f"{abs(lost):.2f} dB {more} {named(name).removesuffix(' (dB)')}")
-    if not told:
-        for key, now in list(gauge.inside.items())[:2]:
-            name, _, unit = named(key).partition(" (")
-            told.append(f"{name} {now:.3g} {unit.rstrip(')')} instead of {design.predicted[key]:.3g}")
-    return (
-        f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends "
-        f"with {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
-    )
+    return f"{text}. --inside-weight keeps a search closer to them"
 
 
 def width_sentence(design: Design) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 from litho_design.judging.front import FrontResult
 from litho_design.reports.advice import WORDS, named
 

@@ -29,6 +29,7 @@ from litho_design.optimisation.process_window import Draw, check_draws, draws, r
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.bench import ViewsBench
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -38,7 +39,6 @@ from litho_design.tasks.design import (
     write_arrays,
     write_level_image,
 )
-from litho_design.tasks.staying_inside import cost_of_staying_inside
 
 
 class Figures(Record):
@@ -210,7 +210,7 @@ class Task:
             tiling=self.printer.tiling_check(whole),
             ensemble=measure_disagreement(self.printers, whole, settings.optics.wave_height_um),
             printability=printability(levels, layout),
-            out_of_distribution=cost_of_staying_inside(self, level),
+            out_of_distribution=out_of_distribution(levels, layout, self.printer.card),
             reference_efficiency=self.reference_efficiency(height_um),
             predicted=self.score(height_um).model_dump(),
             baselines=self.baselines(),

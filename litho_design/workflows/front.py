@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import Target
 from litho_design.judging.front import FrontPoint, FrontResult

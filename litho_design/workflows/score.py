@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
 from litho_design.large.lens import judge_rings
-from litho_design.large.score import judge_from_disk
+from litho_design.large.score import judge_in_bands
 from litho_design.optics.thin_element import ElementKind
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
@@ -47,7 +47,7 @@ def score(
         element: ``thick`` judges every print by the wave propagation method; ignored for a design that is
             loaded.
         stitch: write fields that the prints of the judges are made of, each off its place.
-        band_px: rows of a band at most, to score a hologram of any size band by band, the rest on disk.
+        band_px: rows of a band at most, to print and score a large hologram band by band.
         device: where prints and waves are computed; ignored for a design that is loaded.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
@@ -77,7 +77,7 @@ def score(
         elif band_px is None:
             judgement = judge_rings(folder, record, printers)
         else:
-            judgement = judge_from_disk(folder, record, printers, band_px, stitch, Path(out))
+            judgement = judge_in_bands(folder, record, printers, band_px, stitch)
         result = ScoreResult.of(folder, record, judgement.scores)
         write_score_report(Path(out), result, judgement)
         result.write(out)

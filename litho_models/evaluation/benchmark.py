@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.commands.progress import progress, say_estimate
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import progress, say_estimate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256
@@ -31,9 +31,9 @@ from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.models import build_model, require_models
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
+from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import estimated_floor, stated_floor
-from litho_models.scoring.pairs import paired_scores
-from litho_models.scoring.records import ModelScores, Prediction
+from litho_models.scoring.records import ModelScores, Prediction, paired_scores
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, Fold, ScoredSplit, SplitKind, plan_folds
 
@@ -51,8 +51,8 @@ def benchmark(
     settings: dict[str, Any] | None = None,
     folds: int = GROUPED_FOLDS,
     first_folds: int | None = None,
-    policy: Policy = "offset",
-    background: BackgroundUse = "training",
+    policy: Policy | None = None,
+    background: BackgroundUse | None = None,
     noise: str | Path | None = None,
     open_lock_box: bool = False,
     seed: int = 0,
@@ -70,9 +70,10 @@ def benchmark(
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         first_folds: fit and score only so many of the folds, to compare seeds or settings; None for all.
-        policy: nuisances of ``mae_datum_free_nm``.
-        background: ``training``: each fit's smooth background, learned on its training scans, is added to
-            its predictions; ``shared``: they go through the measurement model, learned there with the fit.
+        policy: nuisances of ``mae_datum_free_nm``; ``offset`` by default, for films ``none``.
+        background: by default ``training``, for films ``none``. ``training``: each fit's smooth background,
+            learned on its training scans, is added to its predictions; ``shared``: they go through the
+            measurement model, learned there with the fit.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
@@ -87,6 +88,10 @@ def benchmark(
     require_models(models)
     dataset = open_store(store)
     scans = dataset.scans()
+    film = dataset.instrument == "sem"
+    policy, background = policy or usual_policy(film), background or usual_background(film)
+    if film:
+        settings = {"nuisance": "none", **(settings or {})}
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
@@ -138,7 +143,7 @@ def benchmark(
         ids = [scan.id for scan in scored]
         maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
         if noise is None:
-            best = min(scores, key=lambda entry: entry.mae_datum_free_nm).model
+            best = min(scores, key=lambda entry: entry.leading_nm).model
             floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
         result = Benchmark(
             run=run_info([seed], len(scans)),

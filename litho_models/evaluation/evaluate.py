@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.diagnostics import device_of, tile_consistency
+from litho_models.evaluation.fit_cache import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen.files import load_frozen
@@ -23,6 +23,7 @@ from litho_models.frozen.on_store import (
 )
 from litho_models.prediction.cost import measured_predictions
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
+from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import stated_floor
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
@@ -34,8 +35,8 @@ def evaluate(
     store: str | Path,
     out: str | Path,
     *,
-    policy: Policy = "offset",
-    background: BackgroundUse = "training",
+    policy: Policy | None = None,
+    background: BackgroundUse | None = None,
     noise: str | Path | None = None,
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
@@ -53,8 +54,9 @@ def evaluate(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances that a scan is freed of.
-        background: whether the background in the model's card is added to the predictions; a card without
+        policy: nuisances that a scan is freed of; ``offset`` by default, for films ``none``.
+        background: ``training`` by default, for films ``none``: whether the background in the model's card is
+            added to the predictions; a card without
             one, or with one of fields of another size, adds none, and the result says so.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
         scan_ids: exactly these scans, locked ones among them too.
@@ -66,6 +68,8 @@ def evaluate(
             other data.
     """
     dataset = open_store(store)
+    film = dataset.instrument == "sem"
+    policy, background = policy or usual_policy(film), background or usual_background(film)
     floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)

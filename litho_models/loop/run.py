@@ -14,7 +14,7 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.workers import Workers, kept_open
+from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.loop.bases import AUTO, choose_base
 from litho_models.loop.closing import Closed, close, fit_with_measurement

@@ -7,6 +7,7 @@ from typing import Any
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
+from litho_models.models.electron_beam import ElectronBeam
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
 from litho_models.models.pbl import Pbl
@@ -19,7 +20,7 @@ MODELS: dict[str, type[Simulator]] = {
     model.name: model
     for model in (
         *(Identity, Affine, AffineMtf, BlurTable, Linear),
-        *(Features, RandomFeatures, Physics, Pbl, Fno),
+        *(Features, RandomFeatures, Physics, ElectronBeam, Pbl, Fno),
     )
 }
 

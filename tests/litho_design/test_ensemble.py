@@ -101,7 +101,6 @@ def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
     design = design_lens(make_printer(layout), tmp_path, settings=settings, ensemble=[other], announce=False)
     assert design.ensemble is not None
     assert design.ensemble.disagreement_nm > 0
-    assert (tmp_path / "focus_window.csv").exists()
     assert (tmp_path / "window.csv").exists()
 
 

@@ -10,18 +10,17 @@ import pandas as pd
 import pytest
 import zarr
 
-from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.schema import DatasetId
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.fit_cache import expected, fit_or_load
-from litho_models.evaluation.results import Benchmark, Evaluation
+from litho_models.evaluation.results import Benchmark, Evaluation, compare
 from litho_models.fitting.runs import TrainingRun, train, training_config
 from litho_models.frozen.freezing import freeze
 from litho_models.scan_terms import NuisanceProtocol
@@ -82,25 +81,13 @@ def test_the_result_is_complete_on_disk(result):
     require_tables_equal_record(
         out,
         Benchmark.FILE_NAME,
-        {
-            "benchmark.csv": {"above_floor_nm": ""},
-            "fits.csv": {
-                "training_s": "seconds",
-                "prediction_s": "seconds_per_scan",
-                "prediction_mib": "peak_memory_mib",
-                "tile_max_nm": "",
-                "tile_rms_nm": "",
-            },
-            "pairs.csv": dict.fromkeys(
-                ("prints", "ci95_over_prints_nm", "p_over_prints", "smallest_p_over_prints"), ""
-            ),
-        },
+        {name: {"above_floor_nm": ""} for name in ("benchmark.csv", "lock_box.csv")},
         pivoted=("policies.csv",),
     )
     policies = pd.read_csv(out / "policies.csv").set_index(["model", "background"])
     for scores in record.scores:
         for background, errors in (("none", scores.without_background), ("training", scores.by_policy)):
-            for error in errors:
+            for error in errors or ():
                 found = policies.loc[(scores.model, background), f"{error.policy}_mae_nm"]
                 assert found == pytest.approx(error.mae_nm)
     assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "metrics.csv"} <= {

@@ -34,17 +34,9 @@ def test_every_column_of_a_table_is_the_field_that_it_names(name: str, tmp_path:
     result = NoiseAnalysis.read(virtual_noise.FOLDER / name)
     write_noise_report(result, [], tmp_path)
     result.write(tmp_path)
-    sigma = {"sigma_nm": "rmse_nm", "sigma_ci95_nm": "rmse_ci95_nm"}
-    shares = {f"coverage_{level}": "" for level in (50, 80, 90)}
-    lines = {"lines_along": "along", "share_of_variance": "share"}
     require_tables_equal_record(
         tmp_path,
         NoiseAnalysis.FILE_NAME,
-        {
-            "budget.csv": sigma,
-            "flat_levels.csv": {"sigma_ci95_nm": "ci95_nm"},
-            "calibration_scans.csv": {"σ": "name", **shares, "coverage_68": "", "coverage_95": ""},
-            **{file.name: lines for file in tmp_path.glob("texture_*.csv")},
-        },
-        pivoted=("calibration.csv", "variance.csv"),
+        {},
+        pivoted=("calibration.csv", "calibration_scans.csv", "variance.csv"),
     )
