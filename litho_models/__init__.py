@@ -7,8 +7,8 @@ from litho_data.foundation.faces import lazy_face
 if TYPE_CHECKING:
     from litho_models.effects import register_effect as register_effect
     from litho_models.evaluation.benchmark import benchmark as benchmark
-    from litho_models.evaluation.compare import compare as compare
     from litho_models.evaluation.evaluate import evaluate as evaluate
+    from litho_models.evaluation.results import compare as compare
     from litho_models.fitting.patches import PatchDataset as PatchDataset
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
@@ -37,7 +37,7 @@ else:
             "benchmark": "litho_models.evaluation.benchmark",
             "build_model": "litho_models.models",
             "close_loop": "litho_models.planning.rounds",
-            "compare": "litho_models.evaluation.compare",
+            "compare": "litho_models.evaluation.results",
             "evaluate": "litho_models.evaluation.evaluate",
             "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",

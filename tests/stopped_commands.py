@@ -45,7 +45,7 @@ from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import make_scans, write_store

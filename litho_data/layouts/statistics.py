@@ -11,6 +11,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Result
+from litho_data.roughness.amplitude import autocorrelation
 
 _FEWEST_PX = 64
 _BIN_PER_UM = 0.05
@@ -116,13 +117,9 @@ def _radial_power(level: Array, pitch_um: float) -> Array:
 
 def _autocorrelation(level: Array, pitch_um: float) -> Array:
     """Autocorrelation along y and x, shape (2, lags); for a constant layout 0 except at lag 0."""
-    centred = level - level.mean()
-    variance = (centred**2).mean()
-    lags = min(round(_LONGEST_LAG_UM / pitch_um), min(level.shape) - 1) + 1
-    result = np.zeros((2, lags))
-    result[:, 0] = 1.0
-    if variance > 0:
-        for lag in range(1, lags):
-            result[0, lag] = (centred[lag:] * centred[:-lag]).mean() / variance
-            result[1, lag] = (centred[:, lag:] * centred[:, :-lag]).mean() / variance
-    return result
+    lags = min(round(_LONGEST_LAG_UM / pitch_um) + 1, min(level.shape) // 2)
+    if level.min() == level.max():
+        return np.eye(1, lags).repeat(2, axis=0)
+    correlation = autocorrelation(level)
+    middle = correlation.shape[1] // 2
+    return np.stack([correlation[:lags, middle], correlation[0, middle : middle + lags]])

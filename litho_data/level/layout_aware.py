@@ -12,7 +12,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, subtract
 from litho_data.register.topography import smooth_measured
 
 if TYPE_CHECKING:
@@ -27,15 +27,14 @@ _LEAST_INSIDE = 0.25
 
 @operation("layout-aware")
 def level_layout_aware(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     layout_level: Array,
     blur_px: Annotated[float, Field(ge=0)] | None = None,
     x_degree: Degree = 1,
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the background that remains once the layout has explained what it can.
 
@@ -45,7 +44,7 @@ def level_layout_aware(
     over the fitted pixels: the datum is part of the response.
 
     Args:
-        height: (ny, nx), any unit.
+        z: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
         blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that
@@ -57,7 +56,6 @@ def level_layout_aware(
         InputError: a layout of another shape or without overlap, or a layout that looks like the
             background itself, such as a ramp, so that the two cannot be separated.
     """
-    z = as_height(height)
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
@@ -66,7 +64,6 @@ def level_layout_aware(
     blurs = _BLURS_PX if blur_px is None else (blur_px,)
     known = np.isfinite(layout_level)
     inside = _inside(known, 2 * blurs[-1])
-    chosen = select(z, mask, masking)
     fitted = inside if chosen is None else chosen & inside
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")

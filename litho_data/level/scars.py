@@ -10,7 +10,7 @@ from scipy import ndimage
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.level.operation import operation
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, as_height, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
 Threshold = Annotated[float, Field(gt=0)]
@@ -19,15 +19,14 @@ Count = Annotated[int, Field(ge=1)]
 
 @operation("mark-scars")
 def mark_scars(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     high: Threshold = 0.666,
     low: Threshold = 0.25,
     min_length_px: Count = 16,
     max_width_px: Count = 4,
     sign: ScarSign = "both",
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Array:
     """Mark strokes along the rows that stand out from the rows above and below them.
 
@@ -43,10 +42,8 @@ def mark_scars(
     Raises:
         InputError: thresholds or sizes outside their range, or an unknown sign.
     """
-    z = as_height(height)
     if low > high:
         raise InputError("scar parameters", got=f"low {low}, high {high}", wanted="low up to high")
-    chosen = select(z, mask, masking)
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
     scars = np.zeros(z.shape, dtype=bool)
@@ -80,8 +77,8 @@ def remove_scars(height: Array, *, scars: Array) -> Levelled:
 
 @operation("remove-scars")
 @wraps(mark_scars)
-def _fill_scars(height: Array, **how: Any) -> Levelled:
-    return remove_scars(height, scars=mark_scars(height, **how))
+def _fill_scars(z: Array, chosen: Array | None, **how: Any) -> Levelled:
+    return remove_scars(z, scars=mark_scars(z, mask=chosen, masking="include", **how))
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:

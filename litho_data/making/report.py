@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.making.gratings import GratingScan, grating_scans
 from litho_data.making.verdict import verdict_of
 from litho_data.reports.page import Page
-from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
+from litho_data.reports.pictures import colour_bar_png, coloured_png, limits, thumbnail
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
@@ -30,58 +31,8 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
-_TABLE: dict[str, tuple[str, str]] = {
-    "scan": ("scan", ""),
-    "model": ("transform", "kind of transform from scan to layout"),
-    "ncc_before": ("correlation, centred", "of height and layout, the scan laid in the middle of its layout"),
-    "ncc_after": ("correlation, registered", "the same where registration put the scan"),
-    "reprojection_px": (
-        "reprojection (px)",
-        "rms distance of matching details that the first fit used",
-    ),
-    "tre_median_nm": (
-        "held-out error, median (nm)",
-        "distance of details that were kept out of the fit: half of them are closer",
-    ),
-    "tre_p95_nm": ("held-out error, p95 (nm)", "the same: 95 % of them are closer"),
-    "corner_sd_nm": (
-        "corner spread (nm)",
-        "standard deviation of the least certain corner when blocks of the scan are drawn anew",
-    ),
-    "overlap": ("overlap", "share of the layout with a measured height"),
-    "bend_um": ("bend (µm)", "how far the scan is bent at most"),
-    "rotation_deg": ("rotation (°)", "angle of the scan on its layout, in its middle"),
-    "singular_min": ("scale, smallest", "stretch of the scan along the direction with the least; 1 is none"),
-    "singular_max": ("scale, largest", "stretch along the direction with the most"),
-    "removed_sd_nm": (
-        "removed by levelling, sd (nm)",
-        "standard deviation of the surface that levelling removed",
-    ),
-}
-_BUDGET: dict[str, tuple[str, str]] = {
-    "scan": ("scan", ""),
-    "sigma_nm": ("all (nm)", "the parts to the right, added in squares"),
-    "sigma_pixel_nm": ("pixel noise (nm)", "noise of single pixels"),
-    "sigma_line_nm": ("line noise (nm)", "what scan lines lie too high or too low"),
-    "sigma_resampling_nm": ("resampling (nm)", "what the interpolation onto the layout's grid may be off"),
-    "sigma_registration_nm": (
-        "registration (nm)",
-        "the slope of the print times the uncertainty of its place",
-    ),
-    "sigma_levelling_nm": ("levelling (nm)", "what the removed surface may be off"),
-    "sigma_calibration_nm": ("z calibration (nm)", "height times the uncertainty of the z scale in the card"),
-}
-_GRATING: dict[str, tuple[str, str]] = {
-    "id": ("scan", ""),
-    "scale_x": ("scale along x", "what a stated length has to be multiplied by to be true"),
-    "scale_x_sd": ("its uncertainty", "standard uncertainty, with that of the period"),
-    "scale_y": ("scale along y", "the same across the lines"),
-    "scale_y_sd": ("its uncertainty, y", "standard uncertainty, with that of the period"),
-    "bow_um": ("bow of a line (µm)", "how far the middle of a line lies too far, against its ends"),
-    "bow_sd_um": ("its uncertainty (µm)", "standard uncertainty, from the scatter along the line"),
-    "tip_at_most_um": ("tip radius, at most (µm)", "the most that the radius of the tip's end can be"),
-    "problem": ("not measured", "why the grating does not show its figures"),
-}
+# By table the columns in their order, each with its title and what it means.
+_COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
@@ -91,7 +42,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
         f"Dataset {store.name}",
         "Raw scans read, levelled, registered onto their layouts and stored.",
         facts={"dataset": store.sha256},
-        words=_TABLE | _BUDGET | _GRATING,
+        words={key: words for table in _COLUMNS.values() for key, words in table.items()},
     )
     _summary(page, result, store)
     _left_out(page, result)
@@ -146,13 +97,13 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     page.heading("Quality of every scan, in numbers", folded=True)
-    shown = quality[[name for name in _TABLE if name in quality]]
+    shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
     page.table(
         shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
     )
     if "sigma_nm" in quality:
         page.table(
-            quality[list(_BUDGET)],
+            quality[list(_COLUMNS["uncertainty"])],
             "What the uncertainty of the heights is made of: root mean square over a scan, its offset "
             "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
             "uncertainty.csv",
@@ -164,7 +115,7 @@ def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
     if scans:
         page.heading("What the grating says about the microscope")
         page.table(
-            [{name: getattr(one, name) for name in _GRATING} for one in scans],
+            [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
             "Scales, unevenness of a line and tip, from the known period of the grating; no other scan is "
             "corrected by them",
             "gratings.csv",
@@ -215,15 +166,13 @@ def _raw(store: Store, scan_id: str) -> Array:
 def _residual_nm(scan: PrintedScan) -> Array:
     from litho_data.register import predicted_topography
 
-    layout = predicted_topography(scan.mask_level, _BLUR_PX)
-    x, z = layout[scan.valid].astype(float), scan.height_um[scan.valid].astype(float)
-    x_mean, z_mean = (float(values.mean()) if values.size else 0.0 for values in (x, z))
-    variance = float(((x - x_mean) ** 2).sum())
-    gain = float(((x - x_mean) * (z - z_mean)).sum()) / variance if variance > 0 else 0.0
-    return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
+    layout = predicted_topography(scan.mask_level, _BLUR_PX).astype(float)
+    design = np.stack([layout, np.ones(scan.shape)], axis=-1)
+    response, *_ = np.linalg.lstsq(design[scan.valid], scan.height_um[scan.valid].astype(float), rcond=None)
+    return (scan.height_um - design @ response) * 1e3
 
 
 def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
     values = np.concatenate([image.ravel() for image in images])
-    low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
+    low, high = limits(values)
     return (-max(-low, high), max(-low, high)) if symmetric else (low, high)

@@ -213,14 +213,13 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
 
 
 def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
-    from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
+    from litho_data.reports.pictures import colour_bar_png, coloured_png, limits, thumbnail
 
     rows, bar = [], colour_bar_png("cividis")
     for name, images in pictures.items():
         shown = []
         for image in images:
-            low, high = (float(one) for one in np.nanpercentile(image, [0.5, 99.5]))
-            shown.append(coloured_png(thumbnail(image), "cividis", low, high))
+            shown.append(coloured_png(thumbnail(image), "cividis", *limits(image)))
         rows.append((name, shown))
     columns = [(title, bar) for title in ("raw", *RECIPES)]
     page.gallery(columns, rows, "Heights before and after each recipe, every picture on a scale of its own.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,31 +26,7 @@ if TYPE_CHECKING:
 # Column of a table to its name for people and what it is; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
-_UNITS = {
-    "per_um": "1/µm",
-    "um2": "µm²",
-    "deg": "°",
-    "um": "µm",
-    "nm": "nm",
-    "px": "px",
-    "mib": "MiB",
-    "db": "dB",
-    "s": "s",
-    "waves": "waves",
-}
-_SHORT = {"ci95": "95 % interval", "mae": "MAE", "rmse": "RMSE", "sd": "standard deviation", "psnr": "PSNR"}
-_SHORT |= {
-    "ssim": "SSIM",
-    "id": "scan",
-    "fwhm": "FWHM",
-    "mtf": "MTF",
-    "psf": "PSF",
-    "sha256": "SHA-256",
-    "k": "k",
-    "icc": "ICC",
-    "eff": "efficiency",
-    "si": "scale-invariant",
-}
+_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
 # Columns that hold keys, which are spelt out like the names of columns.
@@ -119,24 +95,34 @@ class Page:
         """Relative links: (target, text)."""
         self._add("links", links=list(links))
 
-    def table(self, table: Table, caption: str, csv_name: str, digits: int = 2) -> None:
+    def table(
+        self,
+        table: Table,
+        caption: str,
+        csv_name: str,
+        digits: int = 2,
+        columns: Sequence[str] | None = None,
+    ) -> None:
         """A table that sorts; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
-            table: a frame, columns by name, or its rows: mappings or records.
+            table: a frame, columns by name, or its rows: mappings or records. A record in a row has a column
+                for each of its fields, ``row_field``; an interval and a list are spelt out.
             digits: places after the point; a smaller number keeps two figures.
+            columns: those to show, in this order; all by default.
         """
-        frame = _frame(table)
-        columns = []
+        frame = _frame(table, digits)
+        frame = frame if columns is None else frame.reindex(columns=list(columns))
+        shown = []
         for key in map(str, frame.columns):
             name, meaning = self._words.get(key, (spelt_out(key), ""))
-            columns.append({"name": name, "meaning": meaning, "numeric": frame[key].dtype.kind in "iufb"})
+            shown.append({"name": name, "meaning": meaning, "numeric": frame[key].dtype.kind in "iufb"})
         rows = [
             [self._cell(value, digits, str(key)) for key, value in zip(frame.columns, row, strict=True)]
             for row in frame.itertuples(index=False)
         ]
-        meanings = [(column["name"], column["meaning"]) for column in columns if column["meaning"]]
-        self._add("table", caption=caption, csv=csv_name, columns=columns, rows=rows, meanings=meanings)
+        meanings = [(column["name"], column["meaning"]) for column in shown if column["meaning"]]
+        self._add("table", caption=caption, csv=csv_name, columns=shown, rows=rows, meanings=meanings)
         self._tables.append((csv_name, frame))
 
     def figure(self, figure: Figure, caption: str) -> None:
@@ -189,12 +175,23 @@ class Page:
         self._sections[-1]["parts"].append({"kind": kind, **part})
 
 
-def _frame(table: Table) -> pd.DataFrame:
+def _frame(table: Table, digits: int) -> pd.DataFrame:
     import pandas as pd
 
     if isinstance(table, (pd.DataFrame, Mapping)):
         return pd.DataFrame(table)
-    return pd.DataFrame([row.model_dump() if isinstance(row, BaseModel) else row for row in table])
+    return pd.DataFrame([dict(_cells(row, digits)) for row in table])
+
+
+def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Columns and values of a row, those of the records in it beside its own."""
+    for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
+        if isinstance(value, Mapping | BaseModel):
+            yield from _cells(value, digits, f"{prefix}{key}_")
+        elif isinstance(value, tuple) and len(value) == 2 and all(isinstance(end, float) for end in value):
+            yield prefix + key, " … ".join(f"{end:.{digits}f}" for end in value)
+        else:
+            yield prefix + key, ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
 @cache
@@ -205,6 +202,16 @@ def _template() -> jinja2.Template:
     environment = jinja2.Environment(autoescape=True, trim_blocks=True)
     environment.filters["whole_options"] = _whole_options
     return environment.from_string(text)
+
+
+def filled(template: Path, **values: object) -> str:
+    """A page of text from its template (Jinja) and the values that the template names."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(template.read_text(encoding="utf-8")).render(values)
 
 
 def _whole_options(text: str) -> Markup:
@@ -224,7 +231,7 @@ def capitalised(text: str) -> str:
 def spelt_out(key: str) -> str:
     """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:
-        return _SHORT.get(key, key)
+        return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")
     if more and "_" in head:
         return f"{spelt_out(head)}, {more}"
@@ -232,11 +239,11 @@ def spelt_out(key: str) -> str:
     if between:
         return f"{spelt_out(head)}, standard deviation between {more}"
     words, unit = key, ""
-    for suffix, text in _UNITS.items():
+    for suffix, text in _SPELT["units"].items():
         if key.endswith(f"_{suffix}"):
             words, unit = key.removesuffix(f"_{suffix}"), f" ({text})"
             break
-    return " ".join(_SHORT.get(word, word) for word in re.split("_+", words)) + unit
+    return " ".join(_SPELT["short"].get(word, word) for word in re.split("_+", words)) + unit
 
 
 def _text(value: Any, digits: int) -> str:

@@ -112,6 +112,12 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
     return f"data:image/png;base64,{_base64(buffer.getvalue())}"
 
 
+def limits(image: Array) -> tuple[float, float]:
+    """Lowest and highest value of a picture, a few outliers aside."""
+    low, high = np.nanpercentile(image, (0.5, 99.5))
+    return float(low), float(high)
+
+
 def thumbnail(image: Array, side_px: int = 180) -> Array:
     """Every so many pixels of an image (ny, nx), at most this many along a side."""
     step = max(1, -(-max(image.shape) // side_px))

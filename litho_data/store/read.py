@@ -33,7 +33,7 @@ from litho_data.store.contract import (
     require_possible,
     true_shapes,
 )
-from litho_data.store.lock_box import lock_box, lock_box_size
+from litho_data.store.lock_box import lock_box
 from litho_data.store.printed_scan import PrintedScan as PrintedScan
 from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
@@ -177,7 +177,7 @@ class Store:
     @property
     def locked_ids(self) -> list[str]:
         """Ids of the lock box: a sixth of the scans, from different prints, the same in every session."""
-        return lock_box(self.ids, self._print_ids, lock_box_size(len(self)))
+        return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
         """Hash of the raw file of each of these scans, however they were levelled and registered.

@@ -33,7 +33,6 @@ def strength_for_rms(
     *,
     jobs: Sequence[Job] | None = None,
     seed: int = 0,
-    printer: Printer | None = None,
 ) -> KnobStrength:
     """The strength at which a knob changes the noise-free scans by ``rms_nm``.
 
@@ -52,10 +51,10 @@ def strength_for_rms(
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
-    fields = tuple(jobs) if jobs is not None else default_fields(printer or Printer(), seed)
+    fields = tuple(jobs) if jobs is not None else default_fields(Printer(), seed)
 
     def measured(strength: float) -> float:
-        return knob_rms_nm(KnobSetting(name, strength, seed), fields, printer)
+        return knob_rms_nm(KnobSetting(name, strength, seed), fields)
 
     checked(KnobSetting(name, 0.0))
     highest = KNOBS[name].limit

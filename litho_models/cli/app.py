@@ -13,9 +13,7 @@ from litho_data.commands.app import DaskOption, WorkersOption, new_app, run_app,
 from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.cli.check import check
-from litho_models.cli.loop import close_loop
-from litho_models.cli.next_print import next_print
+from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
@@ -145,7 +143,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
-    from litho_models.evaluation.wording import evaluation_verdict
+    from litho_models.evaluation.tables import evaluation_verdict
 
     result = litho_models.evaluate(
         model,

@@ -33,8 +33,7 @@ from litho_models.models import build_model, require_models
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import estimated_floor, stated_floor
-from litho_models.scoring.pairs import paired_scores
-from litho_models.scoring.records import ModelScores, Prediction
+from litho_models.scoring.records import ModelScores, Prediction, paired_scores
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, Fold, ScoredSplit, SplitKind, plan_folds
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from litho_data.foundation.errors import unknown_name
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
-LARGEST_ZOO_BYTES = 8_000_000
 PREFIX = "zoo:"
 _CARD_FILE = "card.json"
 
@@ -48,8 +47,3 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
         known = [*(f"{PREFIX}{name}" for name in list()), *other]
         raise unknown_name("model", text, known, also="the folder of a model")
     return Path(source)
-
-
-def size_bytes(root: str | Path = ZOO_FOLDER) -> int:
-    """What the zoo adds to the package."""
-    return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())

@@ -19,7 +19,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ErrorRow, MeasuredBy, Stage, error_of
 from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.background import learn_background
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.statistics import interval

@@ -27,7 +27,7 @@ from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.model import Placed, Twin, exposed, finished
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
-from litho_models.scan_terms.groups import Labels, groupings
+from litho_models.scan_terms.grouped import Labels, groupings
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})

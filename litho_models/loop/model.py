@@ -16,7 +16,7 @@ from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.groups import ALL, label_of
+from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = dict[str, dict[str, float]]

@@ -13,8 +13,7 @@ from litho_models.loop.fits import State, Study, without_terms
 from litho_models.loop.judging import EXCHANGED_P
 from litho_models.loop.model import Twin
 from litho_models.loop.screening import gains_by, permutation_p
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, Labels
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 
 # Of groupings that do nearly as well the one with the fewest labels is taken.
 NEARLY = 0.95

@@ -19,8 +19,7 @@ from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.loop.fits import ALL_FREE, State, Study
 from litho_models.loop.model import Twin, finished
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, Labels
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
 # Of a direction's information, what must survive the projections for a test to mean anything.

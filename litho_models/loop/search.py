@@ -18,7 +18,7 @@ from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart
 from litho_models.loop.regrouping import NEARLY, regrouped
 from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening, Secants
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 
 MOST_EFFECTS = 8
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
-from litho_models.layers.lookup import interpolate
+from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from litho_models.fast import convolution_stack
 from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
-from litho_models.layers.lookup import PointwiseNet
+from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.precision import adjoint_dtype
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (

@@ -15,9 +15,8 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.monitoring import wording
 from litho_models.monitoring.inputs import gather
 from litho_models.monitoring.judging import DEFAULT_RATE, judge
-from litho_models.monitoring.prints import FIGURES
+from litho_models.monitoring.prints import FIGURES, Check, CheckedModel
 from litho_models.monitoring.report import write_check_report
-from litho_models.monitoring.result import Check, CheckedModel
 
 
 def check(

@@ -31,7 +31,7 @@ from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop.bases import choose_base
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.search import _fitted
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import bare_state, planted, study_of

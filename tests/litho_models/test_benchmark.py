@@ -18,9 +18,8 @@ from litho_data.store.schema import DatasetId
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
-from litho_models.evaluation.results import Benchmark, Evaluation
+from litho_models.evaluation.results import Benchmark, Evaluation, compare
 from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.freezing import freeze
 from litho_models.scan_terms import NuisanceProtocol
