@@ -28,23 +28,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "InputError": "litho_data.foundation.errors",
-            "PrintedScan": "litho_data.store.read",
-            "Recipe": "litho_data.level.recipe",
-            "Scan": "litho_data.scan",
-            "Store": "litho_data.store.read",
-            "build_dataset": "litho_data.making.build",
-            "fetch": "litho_data.cards.fetch",
-            "level_scan": "litho_data.level.scan",
-            "open_store": "litho_data.store.read",
-            "read_layout": "litho_data.readers.layout",
-            "read_scan": "litho_data.readers.read",
-            "register_scan": "litho_data.register.scan",
-            "resample_to_layout": "litho_data.register.resample",
-            "simulate": "litho_data.virtual_fab.simulate",
-            "verify": "litho_data.provenance.verify",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

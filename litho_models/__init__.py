@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
     from litho_models.models import build_model as build_model
+    from litho_models.models import register_simulator as register_simulator
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
     from litho_models.planning.rounds import close_loop as close_loop
@@ -26,26 +27,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "FrozenSimulator": "litho_models.frozen.simulator",
-            "PatchDataset": "litho_models.fitting.patches",
-            "Simulator": "litho_models.simulator",
-            "analyse_noise": "litho_models.noise",
-            "benchmark": "litho_models.evaluation.benchmark",
-            "build_model": "litho_models.models",
-            "close_loop": "litho_models.planning.rounds",
-            "compare": "litho_models.evaluation.results",
-            "evaluate": "litho_models.evaluation.evaluate",
-            "freeze": "litho_models.frozen.freezing",
-            "load_frozen": "litho_models.frozen.files",
-            "model_of_authors": "litho_models.models.authors",
-            "register_effect": "litho_models.effects",
-            "register_metric": "litho_models.scoring.metric_registry",
-            "register_scan_term": "litho_models.scan_terms",
-            "save_frozen": "litho_models.frozen.files",
-            "train": "litho_models.fitting.runs",
-            "zoo": "litho_models.frozen",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -38,16 +38,13 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
     Raises:
         InputError: NaN in the surface, lines shorter than 8 pixels, or another axis.
     """
+    from scipy.signal import periodogram
+
     lines = _lines(height_um, axis)
     size = lines.shape[1]
-    weight = np.hanning(size + 2)[1:-1] if window else np.ones(size)
-    if window:
-        lines = lines - _straight_line(lines)
-    power = np.abs(np.fft.rfft(lines * weight, axis=1)) ** 2
-    density = power.mean(axis=0) * pitch_um / np.sum(weight**2)
-    # Frequencies other than 0 and Nyquist stand for their negative counterparts as well.
-    density[1 : None if size % 2 else -1] *= 2
-    return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
+    shape, trend = (np.hanning(size + 2)[1:-1], "linear") if window else (np.ones(size), "constant")
+    frequency, density = periodogram(lines, 1 / pitch_um, shape, detrend=trend)
+    return Spectrum(frequency[1:], density.mean(axis=0)[1:])
 
 
 def hann(shape: Shape) -> Array:
@@ -74,9 +71,4 @@ def _lines(height_um: Array, axis: Axis) -> Array:
         )
     if lines.shape[1] < 8:
         raise InputError("lines of a spectrum", got=f"{lines.shape[1]} px", wanted="at least 8 px")
-    return lines - lines.mean(axis=1, keepdims=True)
-
-
-def _straight_line(lines: Array) -> Array:
-    position = np.arange(lines.shape[1]) - (lines.shape[1] - 1) / 2
-    return np.outer(lines @ position / (position @ position), position)
+    return lines

@@ -44,7 +44,10 @@ def score(
     out: Out,
     judge: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable"),
+        typer.Option(
+            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable. Without it, "
+            "scan and photograph: the models of the zoo for the same printer"
+        ),
     ] = None,
     scan: Scan = None,
     scan_unit: ScanUnit = None,
@@ -133,8 +136,6 @@ def score(
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
-    if not judge and scan is None and camera is None:
-        raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
     stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
     if camera is not None and camera_pitch_um is None:
         raise InputError(
@@ -161,7 +162,7 @@ def score(
     result = score_design(
         design,
         out,
-        judges=judge or (),
+        judges=judge,
         scan=measured,
         camera=photo,
         element=element,

@@ -53,10 +53,6 @@ SpreadOf = Annotated[
         hidden=True,
     ),
 ]
-Ensemble = Annotated[
-    list[str] | None,
-    typer.Option(help="NAME=MODEL of a further model in the loss; repeatable", hidden=True),
-]
 Judges = Annotated[
     list[str] | None,
     typer.Option(
@@ -111,7 +107,6 @@ def hoe(
     given: Given,
     target: Target = "text",
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
@@ -136,7 +131,7 @@ def hoe(
     from litho_design.workflows.design import design_hologram
 
     design = design_hologram(
-        target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
+        target, model, out, settings=settings, judges=judge, robust=robust,
         band_px=band_px if large else None, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     if not large or Ranks.joined().rank == 0:
@@ -162,7 +157,6 @@ def correct(
     scan_levelling: ScanLevelling = "bow",
     scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = True,
     device: Device = "cpu",
@@ -179,7 +173,7 @@ def correct(
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
-        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
+        judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -192,7 +186,6 @@ def lens(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
@@ -211,7 +204,7 @@ def lens(
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), judges=judge, robust=robust, tile_px=band_px if large else None,
+        judges=judge, robust=robust, tile_px=band_px if large else None,
         device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)

@@ -60,7 +60,7 @@ class LensTask(Task):
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
-        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+        ensemble: further models in the loss, as for ``Task``.
         pictures: pixels of the objects that are pictures (see ``with_objects``).
 
     Raises:

@@ -96,7 +96,7 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """With further models in the search, the loss is their mean or worst + weight * disagreement in waves."""
 
-    risk: Literal["mean", "worst"] = setting("mean", "Loss over the models: their mean, or the worst of them")
+    risk: Literal["mean", "worst"] = setting("worst", "Loss over the models: their mean, or the worst")
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
 from litho_data.reports.page import Words, spelt_out
@@ -74,24 +75,37 @@ def width_sentence(design: Design) -> str:
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
         return ""
-    name, _, unit = named(width.figure).partition(" (")
-    unit = f" {unit.rstrip(')')}" if unit else ""
-    models = list(width.level_heights_um)
-    stated, median, worst = width.stated_median_worst
-    by = models[int(width.values().argmax() if width.less else width.values().argmin())]
-    text = (
-        f"{len(models)} models of this printer print it ({', '.join(models)}; {width.searched_with} of them "
-        f"in the search): {name} {stated:.3g}{unit} as stated by {models[0]}, {median:.3g} in the median, "
-        f"{worst:.3g} at worst, by {by}"
-    )
+    by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
+    text = spread_sentence(width.figure, by_model, width.less, width.gain)
+    text += f" The search used {width.searched_with} of them."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
-            f". They disagree by {width.disagreement:.3g}{unit}, more than the {width.gain:.3g} that the "
-            f"design gains over doing nothing. They differ most about level {level} ({low_um:.3f} to "
-            f"{high_um:.3f} µm): a print with wide fields of it would decide (litho-models next-print)"
+            f" They differ most about level {level} ({low_um:.3f} to {high_um:.3f} µm): a print with wide "
+            "fields of it would decide (litho-models next-print)."
         )
-    return text + "."
+    return text
+
+
+def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
+    """A figure as the first model states it, in the median and at worst, and whether models differ by more.
+
+    Args:
+        less: whether the figure is better when lower; ``gain``: what the design gains over doing nothing.
+    """
+    name, _, unit = named(figure).partition(" (")
+    unit = f" {unit.rstrip(')')}" if unit else ""
+    stated, *_ = by_model
+    worst = (max if less else min)(by_model, key=by_model.__getitem__)
+    text = (
+        f"{len(by_model)} models of this printer print it ({', '.join(by_model)}): {name} "
+        f"{by_model[stated]:.3g}{unit} as stated by {stated}, {median(by_model.values()):.3g} in the median, "
+        f"{by_model[worst]:.3g} at worst, by {worst}."
+    )
+    apart = max(by_model.values()) - min(by_model.values())
+    if gain is not None and apart > gain:
+        text += f" They disagree by {apart:.3g}{unit}, more than the {gain:.3g} gained over doing nothing."
+    return text
 
 
 def thickness_warning(design: Design) -> str:

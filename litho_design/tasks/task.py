@@ -69,7 +69,8 @@ class Task:
         settings: geometry, optics, search, process window.
         printer: frozen model, or nominal heights.
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+        ensemble: further models: the loss is the worst over all, or the mean, plus a penalty on what they
+            disagree about.
 
     Raises:
         InputError: a start that the task does not have, or spreads beyond the range of the propagator.

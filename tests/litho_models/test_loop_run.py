@@ -35,6 +35,7 @@ from litho_models.loop.run import close_loop, dealt
 from litho_models.loop.saving import save_model
 from litho_models.scan_terms import measurement
 from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.statistics import over_units
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
 
@@ -115,6 +116,7 @@ def test_errors_are_means_over_the_scans_that_took_part(closed, store: Path) -> 
     assert after is not None
     gains = [before.by_scan_nm[one] - after.by_scan_nm[one] for one in before.by_scan_nm]
     assert result.gain_nm == pytest.approx(np.mean(gains))
+    assert result.over_scans == over_units(gains, seed=0)
     assert result.error("all", held_out="locked") is not None
     assert result.error("causes", "none", "published") is None
 
@@ -410,6 +412,17 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     # White noise of 4 nm: E|n| = 0.8 sd.
     assert after.mae_nm == pytest.approx(4 * np.sqrt(2 / np.pi), rel=0.1)
     assert after.mae_nm < 0.8 * before.mae_nm
+
+
+@pytest.mark.parametrize(
+    "other", [{"seed": 1}, {"folds": 3}, {"open_lock_box": False}, {"decided_by": ["0" * 64]}], ids=str
+)
+def test_a_loop_of_other_settings_or_further_prints_is_not_replaced(
+    closed, store: Path, other: dict[str, Any]
+) -> None:
+    settings = {"base": BASE, "folds": 2, "open_lock_box": True} | other
+    with pytest.raises(InputError, match="a result with other settings"):
+        close_loop(store, closed[1], **settings)
 
 
 def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -> None:

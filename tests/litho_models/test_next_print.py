@@ -62,6 +62,7 @@ from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
 from tests.litho_models.prints import write_store
+from tests.tables import require_tables_equal_record
 
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
@@ -335,11 +336,17 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
         next_print(loop, tmp_path / "plan", report=killed, **settings)
     assert not (tmp_path / "plan").exists()
     told.clear()
+    with pytest.raises(KeyboardInterrupt):
+        next_print(loop, tmp_path / "plan", report=killed, **{**settings, "seed": 99})
+    assert "0 of 2 tiles are kept" in told[0]
+    told.clear()
     plan = next_print(loop, tmp_path / "plan", report=told.append, **settings)
     assert plan is not None
     assert "1 of 2 tiles are kept" in told[0]
     assert not any(text.startswith("tile 1") for text in told)
     assert NextPrint.read(tmp_path / "plan") == plan
+    middle = {"questions.csv": {"power": "", "random_power": ""}}
+    require_tables_equal_record(tmp_path / "plan", NextPrint.FILE_NAME, middle)
     with pytest.raises(InputError, match=r"seed = 0 where now 99 is asked"):
         next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]
