@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from litho_models.frozen.card import ModelCard
+    from litho_models.frozen.card import CardMetric, ModelCard
 
 _HEADER = """---
 license: apache-2.0
@@ -48,6 +48,7 @@ def model_readme(card: ModelCard) -> str:
         f"# {card.name}\n",
         f"A frozen simulator of a lithography machine (`{card.model}`, variant `{card.variant}`, "
         f"{card.parameters} parameters): layout in, printed height out, both in µm.\n",
+        *([_leading(card.held_out)] if card.held_out else []),
         "## Use\n",
         "```python\nfrom litho_models import load_frozen\n\n"
         'model = load_frozen("this/folder")\n'
@@ -96,13 +97,25 @@ def _training(card: ModelCard) -> str:
     return "| what | value |\n|---|---|\n" + "\n".join(f"| {key} | {value} |" for key, value in rows) + "\n"
 
 
+def _leading(held_out: CardMetric) -> str:
+    return (
+        f"**Mean absolute error {error_text(held_out)}** on scans that a fit has not seen "
+        "(95 % interval over scans; the zero of each scan is free).\n"
+    )
+
+
+def error_text(metric: CardMetric) -> str:
+    """A figure and its interval."""
+    between = f" ({metric.ci95[0]:.2f} … {metric.ci95[1]:.2f})" if metric.ci95 else ""
+    return f"{metric.value:.2f} {metric.unit}{between}"
+
+
 def _metrics(card: ModelCard) -> str:
     if not card.metrics:
         return "Not evaluated.\n"
     head = "| metric | value | split | nuisance policy | background |\n|---|---|---|---|---|\n"
     lines = [
-        f"| {m.name} | {m.value:.2f} {m.unit} | {m.split} | {m.policy} | {m.background} |"
-        for m in card.metrics
+        f"| {m.name} | {error_text(m)} | {m.split} | {m.policy} | {m.background} |" for m in card.metrics
     ]
     return head + "\n".join(lines) + "\n"
 
