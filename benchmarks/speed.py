@@ -123,8 +123,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         heads,
         rows,
         f"{record['size_px']} × {record['size_px']} px, {record['device']}, {record['threads']} of "
-        f"{record['cores']} cores, median of {REPEATS}, float32, torch {record['versions']['torch']}. Training "
-        "as the card states it, on a machine with other work.",
+        f"{record['cores']} cores, median of {REPEATS}, float32, torch {record['versions']['torch']}. "
+        "Training as the card states it, on a machine with other work.",
     )
 
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
     from litho_models.frozen.files import load_frozen as load_frozen
+    from litho_models.frozen.files import push as push
     from litho_models.frozen.files import save_frozen as save_frozen
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
@@ -41,6 +42,7 @@ else:
             "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",
             "model_of_authors": "litho_models.models.authors",
+            "push": "litho_models.frozen.files",
             "register_effect": "litho_models.effects",
             "register_metric": "litho_models.scoring.metric_registry",
             "register_scan_term": "litho_models.scan_terms",
