@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
 
 # Column of a table to its name for people and what it is; the CSV keeps the key.
-Words = Mapping[str, tuple[str, str]]
+Words = Mapping[str, Sequence[str]]
 
 _UNITS = {
     "per_um": "1/µm",
@@ -64,7 +65,8 @@ class Page:
         lead: one line below it.
         run: the run that made the result; by default the one that writes the page.
         facts: what else identifies it, such as hashes and seeds, by name.
-        words: what columns of its tables are called, and what they mean; others are spelt out from their key.
+        words: what columns of its tables are called, and what they mean, or the TOML file that says so;
+            others are spelt out from their key.
     """
 
     def __init__(
@@ -73,13 +75,14 @@ class Page:
         lead: str = "",
         run: RunFacts | None = None,
         facts: Mapping[str, object] | None = None,
-        words: Words | None = None,
+        words: Words | Path | None = None,
     ):
         self.title = title
         self.lead = lead
         self._run = run
         self._facts = dict(facts or {})
-        self._words = words or {}
+        known = tomllib.loads(words.read_text(encoding="utf-8")) if isinstance(words, Path) else words
+        self._words: Words = known or {}
         self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
         self._tables: list[tuple[str, pd.DataFrame]] = []
 

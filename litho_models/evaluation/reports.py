@@ -11,12 +11,13 @@ from litho_data.foundation.report import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
-from litho_models.evaluation.wording import COLUMNS, benchmark_verdict, evaluation_verdict
+from litho_models.evaluation.wording import benchmark_verdict, evaluation_verdict
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.splits.folds import ScoredSplit
 
+_WORDS = Path(__file__).with_name("words.toml")
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
@@ -32,7 +33,7 @@ def write_evaluation_report(
     """Render the result into ``out``; returns the page."""
     scores = result.scores
     title = f"{result.model.name} on {result.dataset.name}"
-    page = Page(title, run=result.run, facts=_facts(result), words=COLUMNS)
+    page = Page(title, run=result.run, facts=_facts(result), words=_WORDS)
     page.verdict(evaluation_verdict(result))
     if result.trained_on_scored_scans:
         count = len(result.trained_on_scored_scans)
@@ -73,7 +74,7 @@ def write_benchmark_report(
     scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
     best = scores[-1]
     on_paper_data = result.dataset.name == _PAPER_DATASET
-    page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=COLUMNS)
+    page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=_WORDS)
     page.verdict(benchmark_verdict(result))
     if result.split.first_folds is not None:
         page.note(f"Only {result.split.first_folds} of {result.split.folds} folds were fitted and scored.")

@@ -24,14 +24,6 @@ _STAGES = {
     "all": "corrected",
 }
 _SHOWN_SCANS = 3
-_WORDS = {
-    "mae_nm": ("MAE (nm)", "mean absolute error over all valid pixels, mean over scans"),
-    "k": ("k", "terms fitted to each scan, on pixels that are not scored"),
-    "printer_numbers": ("numbers of the printer", "fitted, shared by all scans or a group"),
-    "measurement_numbers": ("numbers of the measurement", "fitted, shared by all scans or a group"),
-    "gain_nm2": ("gain (nm²)", "taken from the squared error of held-out scans"),
-    "left_out_nm": ("error without it (nm more)", "k = 1, the rest fitted again"),
-}
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
@@ -41,7 +33,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         "From the residual on held-out scans to causes and laws, to a corrected model.",
         run=result.run,
         facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
-        words=_WORDS,
+        words=Path(__file__).with_name("words.toml"),
     )
     page.verdict(verdict_text(result))
     page.tiles(

@@ -14,7 +14,6 @@ from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.texture import Texture
-from litho_models.noise.wording import COLUMNS
 from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
-    page = Page(title, run=result.run, facts=facts, words=COLUMNS)
+    page = Page(title, run=result.run, facts=facts, words=Path(__file__).with_name("words.toml"))
     page.verdict(_verdict(floor))
     page.note(*result.notes)
     if references:

@@ -21,15 +21,6 @@ if TYPE_CHECKING:
 
 _SHOWN_LAYOUTS = 4
 _COLUMNS = ("name", "status", "prints_needed", "difference_nm", "noise_nm", "form_nm", "text")
-_WORDS = {
-    "text": ("asked", ""),
-    "power": ("power", f"chance that these prints give the right answer; {ENOUGH} or more decides"),
-    "random_power": ("with random layouts", "the same, scanned alike, on random layouts"),
-    "prints_needed": ("prints needed", f"for a power of {ENOUGH}; empty: more than were looked at"),
-    "difference_nm": ("difference (nm)", "between the two nearest answers, root mean square over the prints"),
-    "noise_nm": ("noise (nm)", "along that difference, for one pixel; large where neighbours are alike"),
-    "form_nm": ("form (nm)", "the model's own error at most; twice as much of a difference decides nothing"),
-}
 
 
 def write_report(
@@ -42,7 +33,7 @@ def write_report(
         "four of them references.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
-        words=_WORDS,
+        words=Path(__file__).with_name("words.toml"),
     )
     page.verdict(_verdict(plan))
     first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
