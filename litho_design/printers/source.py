@@ -14,6 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 
 Device = str | torch.device
+# The models of the zoo that judge a design: one of each kind. Ridges go astray beyond smooth layouts.
+JUDGES = ("physics", "pbl", "fno")
 
 
 def load_printer(
@@ -81,7 +83,7 @@ def load_printers(
 def models_at_hand(
     printers: Sequence[Printer], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Models of the zoo that were trained on the prints of the first of some models, and are none of them.
+    """The judges of the zoo that were trained on the prints of the first of some models, and are none of them.
 
     A model that was not calibrated for the layout is left out.
     """
@@ -89,7 +91,7 @@ def models_at_hand(
 
     dataset, known = _dataset(printers[0].card), {str(one.card.get("weights_sha256")) for one in printers}
     found = []
-    for name in zoo.list() if dataset else ():
+    for name in JUDGES if dataset else ():
         simulator = load_frozen(zoo.folder(name), device=device)
         if _dataset(simulator.card) != dataset or str(simulator.card.get("weights_sha256")) in known:
             continue
