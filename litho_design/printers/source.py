@@ -83,7 +83,7 @@ def load_printers(
 def models_at_hand(
     printers: Sequence[Printer], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """The judges of the zoo that were trained on the prints of the first of some models, and are none of them.
+    """Judges of the zoo that were trained on the prints of the first of some models, and are none of them.
 
     A model that was not calibrated for the layout is left out.
     """
