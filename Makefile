@@ -13,7 +13,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
 
-.PHONY: help setup demo trials gap zoo docs test test-fast test-cpus check check-all format clean
+.PHONY: help setup demo trials gap zoo docs test test-fast test-cpus check check-all format release clean
 
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
@@ -69,6 +69,9 @@ check-all: check   ## what is too long for CI, hours: all tests as they are and 
 format: $(STAMP)   ## bring the code into the common style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+release: check test ## build, try the wheel in empty environments, tag the version
+	.ci/release
 
 clean:             ## remove the environment and the caches, keep results
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache *.egg-info

@@ -18,7 +18,7 @@ from benchmarks.measured_figures import draw_prediction
 from benchmarks.measured_models import benchmark_table, headline_table, in_one, noise_table
 from benchmarks.record import publish
 from examples.demo import PAPER_SEEDS
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"

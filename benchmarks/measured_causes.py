@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
-from litho_data.foundation.commands import run_script
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.commands.progress import run_script
+from litho_data.reports.pictures import new_figure
 from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 from litho_data.store import open_store
 
 

@@ -6,8 +6,7 @@ from itertools import combinations
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from litho_models.scoring.pairs import paired_scores
-from litho_models.scoring.records import ModelScores
+from litho_models.scoring.records import ModelScores, paired_scores
 
 _FREE = {
     "none": "nothing",
@@ -84,7 +83,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
     rows: list[tuple[str, ...]] = []
-    for name in ("affine", "physics", "linear", "pbl", "fno", "features", "random-features"):
+    for name in ("affine", "physics", "pbl", "fno", "random-features"):
         score = scores[name]
         full = next(entry["mae_nm"] for entry in score["by_policy"] if entry["policy"] == "full")
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
@@ -97,12 +96,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         ("model", "parameters", "zero height free (k = 1)", "offset, gain, tilt and bow free (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds: each scan is predicted by models that were not trained on it, with the smooth background "
-        "that their training scans share. k counts the terms fitted to each scan, on other pixels than those "
-        "scored. Intervals: 95 %, bootstrap over scans, in the last row but one over the 6 prints. Scans of "
-        "a print are not independent: with 6 prints no sign-flip test goes below p = 0.031. The last row but "
-        "one is an upper estimate for models of the layout alone; it counts what place, field and print "
-        "share as noise.",
+        "folds, each predicted by models that were not trained on it, with the smooth background of their "
+        "training scans. k: terms fitted to each scan, on pixels that are not scored. Intervals: 95 %, over "
+        "scans; in the last row but one over the 6 prints. That row is an upper estimate: it counts what "
+        "place, field and print share as noise.",
     )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import publish
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
 from litho_models.frozen.card import ModelCard

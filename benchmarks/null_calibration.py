@@ -23,9 +23,9 @@ import numpy as np
 import torch
 
 from benchmarks.record import conclude, options, origin, write_record
-from litho_data.foundation.commands import run_script
-from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
+from litho_data.commands.progress import run_script
 from litho_data.layouts import random_layout
+from litho_data.sharing.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
 from litho_models.loop.closing import close

@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, options, origin, usable_cores
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_design.holograms.settings import hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target

@@ -24,9 +24,9 @@ from scipy.stats import binomtest
 
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
-from litho_data.build.build import build_dataset
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
 from litho_models.loop.closing import Closed

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.virtual_fab.settings import Noise
 from litho_models.noise import NoiseAnalysis
 

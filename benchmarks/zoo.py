@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.measured import FOLDER, ROOT, in_table
 from litho_data import build_dataset
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, open_store
 from litho_models.evaluation.results import Benchmark
@@ -26,12 +26,13 @@ from litho_models.frozen.card import OUT_OF_FOLD, TRAINED_ON, Attribution, CardM
 from litho_models.frozen.files import README_FILE, load_frozen
 from litho_models.frozen.freezing import SCAN_AXIS, freeze
 from litho_models.frozen.on_store import card_background, predict_frozen
-from litho_models.frozen.readme import error_text, model_readme
+from litho_models.frozen.readme import model_readme
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
 
 CARD = ROOT / "datasets" / "neural-lithography.toml"
+LARGEST_ZOO_BYTES = 10_000_000
 # The model that was scored has it; whose it is the prints cannot tell.
 WHOLE: dict[str, dict[str, Attribution]] = {"pbl": {SCAN_AXIS: "printer"}}
 LIMITATIONS = [
@@ -85,9 +86,9 @@ def make_zoo(
         cards[name] = card.model_copy(update=described)
         cards[name].write(folder)
         (folder / README_FILE).write_text(model_readme(cards[name]), encoding="utf-8")
-    size = zoo.size_bytes(root)
-    if size > zoo.LARGEST_ZOO_BYTES:
-        raise InputError("size of the zoo", got=f"{size} bytes", wanted=f"at most {zoo.LARGEST_ZOO_BYTES}")
+    size = size_bytes(root)
+    if size > LARGEST_ZOO_BYTES:
+        raise InputError("size of the zoo", got=f"{size} bytes", wanted=f"at most {LARGEST_ZOO_BYTES}")
     return cards
 
 
@@ -113,6 +114,11 @@ def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
         )
         for row, background in columns
     ]
+
+
+def size_bytes(root: str | Path) -> int:
+    """What the zoo adds to the package."""
+    return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())
 
 
 def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtocol, ModelScores]:
@@ -148,8 +154,8 @@ def main() -> None:
     for name, card in cards.items():
         print(f"{name:16} {card.parameters:9,} numbers")
         for metric in card.metrics:
-            print(f"  {metric.name:16} {error_text(metric):28} policy {metric.policy:8} {metric.split}")
-    print(f"{zoo.ZOO_FOLDER.name}: {zoo.size_bytes() / 1e6:.2f} MB")
+            print(f"  {metric.name:16} {metric.text:28} policy {metric.policy:8} {metric.split}")
+    print(f"{zoo.ZOO_FOLDER.name}: {size_bytes(zoo.ZOO_FOLDER) / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

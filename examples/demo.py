@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from examples.demo_story import CORRECTED, FAB, tell
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_models.loop.record import CloseLoop
 
 BIN = Path(sys.executable).parent

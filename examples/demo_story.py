@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data import open_store
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import model_colour, new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import model_colour, new_figure
 from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder
@@ -18,7 +18,7 @@ from litho_design.judging.loaded import LoadedDesign
 from litho_design.reports.parts import BRIGHTEST
 from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
-from litho_models.evaluation.wording import benchmark_verdict
+from litho_models.evaluation.tables import benchmark_verdict
 from litho_models.loop.record import CloseLoop, FoundEffect
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import argparse
 import torch
 
 import litho_design
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_design.optics import centred_grid, make_propagator
 
 WAVELENGTH_UM, PLANES = 0.6328, 9

@@ -13,7 +13,7 @@ import argparse
 import numpy as np
 import pandas as pd
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.level import layout_in_scan_frame, level_layout_aware, level_polynomial
 from litho_data.store import Store, open_store
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 import litho_design
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 
 WAVELENGTH_UM, APERTURE, IMMERSION = 0.6328, 0.8, 1.0
 PHOTONS, BACKGROUND, STEP_UM = 3000.0, 5.0, 0.02

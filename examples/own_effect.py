@@ -14,7 +14,7 @@ import argparse
 import torch
 from torch import Tensor
 
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_models import close_loop, register_effect, register_scan_term
 from litho_models.effects import Effect, FieldContext, Parameter, of_single_scans
 from litho_models.effects.effect import Values

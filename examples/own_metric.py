@@ -13,7 +13,7 @@ import argparse
 
 import numpy as np
 
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.store import PrintedScan
 from litho_models import evaluate, register_metric
 

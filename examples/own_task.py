@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 import litho_design
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 
 NANOMETRES, PLANES_UM = (640, 532, 473), (-4.0, 0.0, 4.0)
 

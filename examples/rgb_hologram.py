@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import litho_design
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_design.optics import centred_grid, make_propagator
 
 COLOURS_UM = (0.640, 0.532, 0.473)

@@ -16,7 +16,7 @@ from torchoptics.elements import Lens
 from torchoptics.profiles import gaussian, laguerre_gaussian
 
 import litho_design
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 
 WAVELENGTH, PITCH = 632.8e-9, 0.1e-6
 

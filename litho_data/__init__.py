@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
-    from litho_data.build.build import build_dataset as build_dataset
     from litho_data.cards.fetch import fetch as fetch
     from litho_data.foundation.errors import InputError as InputError
     from litho_data.level.recipe import Recipe as Recipe
     from litho_data.level.scan import level_scan as level_scan
+    from litho_data.making.build import build_dataset as build_dataset
     from litho_data.provenance.verify import verify as verify
     from litho_data.readers.layout import read_layout as read_layout
     from litho_data.readers.read import read_scan as read_scan
@@ -28,23 +28,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "InputError": "litho_data.foundation.errors",
-            "PrintedScan": "litho_data.store.read",
-            "Recipe": "litho_data.level.recipe",
-            "Scan": "litho_data.scan",
-            "Store": "litho_data.store.read",
-            "build_dataset": "litho_data.build.build",
-            "fetch": "litho_data.cards.fetch",
-            "level_scan": "litho_data.level.scan",
-            "open_store": "litho_data.store.read",
-            "read_layout": "litho_data.readers.layout",
-            "read_scan": "litho_data.readers.read",
-            "register_scan": "litho_data.register.scan",
-            "resample_to_layout": "litho_data.register.resample",
-            "simulate": "litho_data.virtual_fab.simulate",
-            "verify": "litho_data.provenance.verify",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -77,7 +77,7 @@ class Scan:
         )
 
     def _repr_html_(self) -> str:
-        from litho_data.foundation.report_pictures import shown_html
+        from litho_data.reports.pictures import shown_html
 
         return shown_html(repr(self), height_um=self.height_um)
 

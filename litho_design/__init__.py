@@ -27,27 +27,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "Element": "litho_design.elements.element",
-            "MeasuredSource": "litho_design.judging.measured",
-            "PhotoSource": "litho_design.images.photograph",
-            "Task": "litho_design.tasks.task",
-            "compare": "litho_design.workflows.compare",
-            "correct": "litho_design.workflows.design",
-            "design": "litho_design.workflows.design",
-            "design_hologram": "litho_design.workflows.design",
-            "design_lens": "litho_design.workflows.design",
-            "design_settings": "litho_design.optimisation.settings",
-            "export": "litho_design.exports.files",
-            "first": "litho_design.workflows.first",
-            "hologram_settings": "litho_design.holograms.settings",
-            "import_levels": "litho_design.exports.files",
-            "lens_settings": "litho_design.lenses.settings",
-            "load_design": "litho_design.judging.loaded",
-            "load_printer": "litho_design.printers.source",
-            "register_task": "litho_design.tasks.task",
-            "score": "litho_design.workflows.score",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -7,8 +7,8 @@ from litho_data.foundation.faces import lazy_face
 if TYPE_CHECKING:
     from litho_models.effects import register_effect as register_effect
     from litho_models.evaluation.benchmark import benchmark as benchmark
-    from litho_models.evaluation.compare import compare as compare
     from litho_models.evaluation.evaluate import evaluate as evaluate
+    from litho_models.evaluation.results import compare as compare
     from litho_models.fitting.patches import PatchDataset as PatchDataset
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
     from litho_models.models import build_model as build_model
+    from litho_models.models import register_simulator as register_simulator
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
     from litho_models.planning.rounds import close_loop as close_loop
@@ -27,27 +28,4 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "FrozenSimulator": "litho_models.frozen.simulator",
-            "PatchDataset": "litho_models.fitting.patches",
-            "Simulator": "litho_models.simulator",
-            "analyse_noise": "litho_models.noise",
-            "benchmark": "litho_models.evaluation.benchmark",
-            "build_model": "litho_models.models",
-            "close_loop": "litho_models.planning.rounds",
-            "compare": "litho_models.evaluation.compare",
-            "evaluate": "litho_models.evaluation.evaluate",
-            "freeze": "litho_models.frozen.freezing",
-            "load_frozen": "litho_models.frozen.files",
-            "model_of_authors": "litho_models.models.authors",
-            "push": "litho_models.frozen.files",
-            "register_effect": "litho_models.effects",
-            "register_metric": "litho_models.scoring.metric_registry",
-            "register_scan_term": "litho_models.scan_terms",
-            "save_frozen": "litho_models.frozen.files",
-            "train": "litho_models.fitting.runs",
-            "zoo": "litho_models.frozen",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

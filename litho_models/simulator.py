@@ -15,6 +15,33 @@ from litho_models.layers.ranges import Range
 Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
 SMALL_PARAMETERS = 64
+FIRST_SPOT_UM = 0.2
+"""Spot of the first printer, standard deviation: the default lengths of models are multiples of it."""
+_RESOLVED_PX = (0.5, 10.0)
+_SPOT_PX = 2.0
+
+
+def spot_um(pitch_um: float) -> float:
+    """Spot (standard deviation, µm) to which default lengths belong, for layouts of a pitch.
+
+    That of the first printer, unless it would be less than half a pixel or more than ten: then the printer is
+    another one, and layouts are taken to resolve its spot as they did that of the first, by two pixels.
+    """
+    low, high = _RESOLVED_PX
+    return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
+
+
+def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
+    """The fields of a config that are lengths, with their defaults or what is ``set_``, for a pitch."""
+    scale = spot_um(pitch_um) / FIRST_SPOT_UM
+    if scale == 1:
+        return {}
+    lengths = getattr(config, "LENGTHS", ())
+    values = {name: set_.get(name, config.model_fields[name].default) for name in lengths}
+    return {
+        name: tuple(scale * one for one in value) if isinstance(value, tuple) else scale * value
+        for name, value in values.items()
+    }
 
 
 class SimulatorConfig(BaseModel):
@@ -26,6 +53,8 @@ class SimulatorConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {}
+    # Defaults that are multiples of the first printer's spot.
+    LENGTHS: ClassVar[tuple[str, ...]] = ()
 
     variant: Variant = "default"
     pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
@@ -40,7 +69,9 @@ class SimulatorConfig(BaseModel):
             InputError: unknown variant.
         """
         require_known("variant", variant, VARIANTS)
-        return cls(**{"variant": variant, **cls.VARIANT_FIELDS.get(variant, {}), **fields})
+        own = cls.VARIANT_FIELDS.get(variant, {})
+        lengths = scaled_lengths(cls, own, fields.get("pitch_um", cls.model_fields["pitch_um"].default))
+        return cls(**{"variant": variant, **own, **lengths, **fields})
 
     @property
     def full_height_um(self) -> float:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.foundation import report
 from litho_data.foundation.faces import let_waiting_threads_sleep
+from litho_data.reports import page as report
 
 # Before any test loads torch.
 let_waiting_threads_sleep()

@@ -31,6 +31,7 @@ class Fault(NamedTuple):
 AXES, WHOLE = "tests/litho_data/test_axes.py", "tests/litho_data/test_whole_store.py"
 BEGUN, OPTICS = "tests/litho_data/test_begun.py", "tests/litho_design/test_propagation_laws.py"
 CHECK = "tests/litho_models/test_check.py -k small"
+RUN, NEXT = "tests/litho_models/test_loop_run.py", "tests/litho_models/test_next_print.py"
 FAULTS = [
     # Axes and half pixels.
     Fault("a canvas half a pixel off", "litho_data/virtual_fab/canvas.py",
@@ -47,9 +48,9 @@ FAULTS = [
           "(there - here) * pitch / 2", "(here - there) * pitch / 2", f"{OPTICS} -k band"),
     Fault("room of a target of another size", "litho_design/optics/angular_spectrum.py",
           "(length - (here + there) / 2)", "(length - here)", f"{OPTICS} -k band"),
-    Fault("separations of a target of another size", "litho_design/optics/angular_spectrum.py",
-          "torch.where(index < there, index, index - shortest)",
-          "torch.where(index < here, index, index - shortest)", f"{OPTICS} -k part"),
+    Fault("separations of a target of another size", "litho_design/optics/convolution.py",
+          "torch.where(index < there, index, index - length)",
+          "torch.where(index < here, index, index - length)", f"{OPTICS} -k part"),
     Fault("a decimetre", "litho_data/foundation/units.py", '"dm": 1e5', '"dm": 1e4', AXES),
     # Keys.
     Fault("own layouts by their shape", "litho_data/virtual_fab/simulate.py",
@@ -85,7 +86,37 @@ FAULTS = [
           "        old.replace(target)\n    shutil", "        pass\n    shutil",
           f"{BEGUN} tests/litho_data/test_files.py"),
     Fault("leftovers stay", "litho_data/foundation/begun.py", "clear_leftovers(folder)", "pass", BEGUN),
-    Fault("a dead worker takes all jobs with it", "litho_data/foundation/workers.py",
+    Fault("settings of a loop without the further prints", "litho_models/loop/run.py",
+          '"new_prints": list(decided_by)', '"new_prints": []', f"{RUN} -k other_settings"),
+    Fault("tiles of another seed", "litho_models/planning/run.py",
+          "**asked})[:16]", "**(asked | {'seed': 0})})[:16]", f"{NEXT} -k resumes"),
+    # Leaks.
+    Fault("lines of the scan's own fold", "litho_models/loop/single_scans.py",
+          "others = self.study.fold_of != fold", "others = self.study.fold_of >= 0",
+          "tests/litho_models/test_single_scans.py -k other_folds"),
+    Fault("a rival judged on scans that it was fitted on", "litho_models/loop/fits.py",
+          "placed = common.at(vector).placed()", "placed = common.placed()",
+          "tests/litho_models/test_loop_model.py -k not_seen"),
+    Fault("a measurement learned on held-out scans too", "litho_models/evaluation/fit_cache.py",
+          "fitted.model, fold.training, fitted.validation_ids",
+          "fitted.model, [*fold.training, *fold.held_out], fitted.validation_ids",
+          "tests/litho_models/test_benchmark.py -k moves_what"),
+    Fault("a scan freed by what it says itself", "litho_models/loop/closing.py",
+          "own = np.flatnonzero(study.fold_of != fold).tolist()", "own = list(range(len(scans)))",
+          f"{RUN} -k others_say"),
+    # Reports.
+    Fault("two columns swapped", "litho_models/evaluation/tables.py",
+          '"mae_abs_nm": s.mae_abs_nm', '"mae_abs_nm": s.mae_datum_free_nm',
+          "tests/litho_models/test_benchmark.py -k complete_on_disk"),
+    Fault("waves without the zero", "litho_design/reports/parts.py",
+          "(height - printed[0]) / wave_um", "height / wave_um", "tests/test_tables.py -k waves"),
+    Fault("another interval at a bar", "litho_models/evaluation/plots.py",
+          'getattr(s, f"{error}_ci95_nm")', 's.mae_abs_ci95_nm',
+          "tests/test_tables.py -k bar"),
+    Fault("the interval of another figure", "litho_models/loop/results.py",
+          "over_scans=over_units(gains, seed=",
+          "over_scans=over_units(list(after.by_scan_nm.values()), seed=", f"{RUN} -k errors_are_means"),
+    Fault("a dead worker takes all jobs with it", "litho_data/sharing/workers.py",
           "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
 ]  # fmt: skip
 

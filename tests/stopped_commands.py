@@ -15,24 +15,46 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.build import build_dataset
 from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.layouts import write_layout_set
+from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.virtual_fab import simulate
+from litho_design import (
+    compare,
+    correct,
+    design_hologram,
+    design_lens,
+    export,
+    first,
+    hologram_settings,
+    lens_settings,
+)
+from litho_design.reliefs.settings import relief_settings
+from litho_models.effects import get_effect
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.evaluate import evaluate
 from litho_models.fitting.runs import train
 from litho_models.frozen.exporting import export_model
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze as freeze_model
+from litho_models.loop import bases, closing
+from litho_models.noise.analyse import analyse_noise
+from litho_models.planning.rounds import close_loop
+from litho_models.planning.run import next_print
+from litho_models.scan_terms import measurement
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_data.campaigns import write_campaign
+from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import make_scans, write_store
 from tests.stops import stopped_after, writes_of
 
 # What differs between two runs of one command.
 _VOLATILE = {
     "seconds",
+    "seconds_per_iteration",
     "started",
     "command",
     "commit",
@@ -102,6 +124,88 @@ def program(folder: Path) -> None:
     export_model(load_frozen("zoo:physics"), folder / "out" / "physics.pt2", 64)
 
 
+def score_models(folder: Path) -> None:
+    benchmark(folder / "prints.zarr", folder / "out", models=["affine", "pbl"], folds=2, settings=QUICK)
+
+
+def score_model(folder: Path) -> None:
+    evaluate("zoo:physics", folder / "prints.zarr", folder / "out")
+
+
+def noise(folder: Path) -> None:
+    analyse_noise(folder / "prints.zarr", folder / "out")
+
+
+def _planted(folder: Path) -> None:
+    """Prints of a small base that remember the lines before, and a loop that seeks little else."""
+    strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
+    write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
+    causes = [get_effect(one) for one in ("write-order-memory", "slope-thinning")]
+    closing.screened_effects = lambda tip_radius_um: causes
+    closing.LAWS, closing.TABLES = {}, {}
+    measurement._OFFERS = ()
+    bases.build_model = lambda *name, **facts: base_model()
+
+
+def loop(folder: Path) -> None:
+    close_loop(folder / "prints.zarr", folder / "out", base="affine-mtf", folds=2)
+
+
+def loop_nested(folder: Path) -> None:
+    close_loop(folder / "prints.zarr", folder / "out", base="affine-mtf", folds=2, nested="folds")
+
+
+def _closed(folder: Path) -> None:
+    _planted(folder)
+    close_loop(folder / "prints.zarr", folder / "loop", base="affine-mtf", folds=2)
+
+
+def plan(folder: Path) -> None:
+    next_print(folder / "loop", folder / "out", prints=2, field_um=6.4, steps=2)
+
+
+_SMALL = {
+    "layout.size_px": 32,
+    "search.iterations": 4,
+    "search.checkpoint_every": 2,
+    "search.polish_rounds": 1,
+}
+_SMALL_OPTICS = _SMALL | {"window.yield_draws": 2, "optics.distance_um": 12}
+_QUIET = {"judges": (), "announce": False}
+
+
+def hologram(folder: Path) -> None:
+    made = hologram_settings(changes=_SMALL_OPTICS)
+    design_hologram("ring", "none", folder / "out", settings=made, **_QUIET)
+
+
+def lens(folder: Path) -> None:
+    made = lens_settings("direct", changes=_SMALL_OPTICS)
+    design_lens("none", folder / "out", settings=made, **_QUIET)
+
+
+def relief(folder: Path) -> None:
+    correct("staircase", "none", folder / "out", settings=relief_settings(_SMALL), **_QUIET)
+
+
+def first_hologram(folder: Path) -> None:
+    first(folder / "out", target="ring", settings=hologram_settings(changes=_SMALL_OPTICS), announce=False)
+
+
+def comparison(folder: Path) -> None:
+    made = hologram_settings(changes=_SMALL_OPTICS)
+    compare(made, ["none"], folder / "out", target="ring", seeds=(0, 1), announce=False)
+
+
+def _designed(folder: Path) -> None:
+    made = hologram_settings(changes=_SMALL_OPTICS)
+    design_hologram("ring", "none", folder / "design", settings=made, **_QUIET)
+
+
+def export_design(folder: Path) -> None:
+    export(folder / "design", "png16", folder / "out")
+
+
 def nothing(folder: Path) -> None:
     pass
 
@@ -118,6 +222,18 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "train-small": (_scans, train_small),
     "freeze": (nothing, freeze),
     "export-model": (nothing, program),
+    "benchmark": (_scans, score_models),
+    "evaluate": (_scans, score_model),
+    "noise": (_scans, noise),
+    "close-loop": (_planted, loop),
+    "close-loop-nested": (_planted, loop_nested),
+    "next-print": (_closed, plan),
+    "hoe": (nothing, hologram),
+    "lens": (nothing, lens),
+    "correct": (nothing, relief),
+    "first": (nothing, first_hologram),
+    "compare": (nothing, comparison),
+    "export-design": (_designed, export_design),
 }
 
 

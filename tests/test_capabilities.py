@@ -85,8 +85,8 @@ def public_names() -> set[str]:
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
                 names |= {f"{room}.{name}" for name in ast.literal_eval(node.value)}
-            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "lazy_face":
-                names |= {f"{room}.{name}" for name in ast.literal_eval(node.args[1])}
+            elif isinstance(node, ast.ImportFrom):
+                names |= {f"{room}.{alias.name}" for alias in node.names if alias.asname == alias.name}
     return {name for name in names if name.rpartition(".")[0] not in INNER}
 
 

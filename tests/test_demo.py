@@ -12,7 +12,7 @@ import litho_data
 import litho_design
 import litho_models
 from examples.demo_story import CORRECTED, FAB, tell
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from tests.litho_models.prints import make_scans, write_store
 
 ROOT = Path(__file__).parents[1]

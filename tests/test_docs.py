@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -135,6 +136,21 @@ def test_a_tutorial_runs_and_its_page_shows_its_code(renderer, name, tmp_path, m
     outputs = re.findall(r"^```text\n(.*?)\n```", page, re.MULTILINE | re.DOTALL)
     assert len(outputs) == len([said for said, _ in ran if said])
     assert page.count("](" + name + "-") == len([value for _, value in ran if hasattr(value, "savefig")]) > 0
+
+
+@pytest.mark.parametrize("name", SMALLER)
+def test_a_notebook_is_its_tutorial_after_one_cell_that_installs(renderer, name):
+    folder = DOCS / "tutorials"
+    made = json.loads((folder / f"{name}.ipynb").read_text("utf-8"))
+    first, *others = [(cell["cell_type"], "".join(cell["source"])) for cell in made["cells"]]
+    assert others == renderer.cells((folder / f"{name}.py").read_text("utf-8"))
+    assert "%pip install" in first[1]
+    # What format 4.5 asks of a cell: an id of its own, and of code its outputs and their number.
+    ids = [cell["id"] for cell in made["cells"]]
+    assert (made["nbformat"], made["nbformat_minor"], len(set(ids))) == (4, 5, len(ids))
+    for cell in made["cells"]:
+        asked = {"cell_type", "id", "metadata", "source"}
+        assert set(cell) == asked | ({"outputs", "execution_count"} if cell["cell_type"] == "code" else set())
 
 
 SHORT = [page for page in PAGES if "**In short" in page.read_text("utf-8")]

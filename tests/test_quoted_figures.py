@@ -39,17 +39,6 @@ def photographs(record: dict[str, Any]) -> list[str]:
     ]
 
 
-def solids(record: dict[str, Any]) -> list[str]:
-    rows = record["rows"]
-    closed = sum(row["trimesh_closed"] and row["numpy_stl_closed"] for row in rows)
-
-    def span(levels: str, places: int) -> str:
-        sizes = [row["megabytes"] for row in rows if row["levels"] == levels]
-        return f"{min(sizes):.{places}f} to {max(sizes):.{places}f} MB"
-
-    return [f"{closed} of {len(rows)} files were closed", f"takes {span('zoo:physics', 0)}"]
-
-
 def mixed_up(record: dict[str, Any]) -> list[str]:
     cases = record["cases"]
     named = sum(set(case["touched"]) <= set(case["named"]) for case in cases)
@@ -177,7 +166,6 @@ def quadrants(record: dict[str, Any]) -> list[str]:
 QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
     "relief/relief.json": ("optics.md", reliefs),
     "photographs/photographs.json": ("scores.md", photographs),
-    "stl/stl.json": ("export.md", solids),
     "mixed-up/mixed_up.json": ("own_data.md", mixed_up),
     "drift-alarm/drift_alarm.json": ("checking.md", alarms),
     "registration/registration.json": ("registration.md", warps),

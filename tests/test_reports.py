@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from litho_data.foundation.report import Page, spelt_out
-from litho_data.foundation.report_pictures import (
+from litho_data.reports.page import Page, spelt_out
+from litho_data.reports.pictures import (
     DARK,
     LIGHT,
     colour_bar_png,

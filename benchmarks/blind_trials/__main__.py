@@ -25,9 +25,9 @@ from benchmarks.blind_trials.campaign import (
 )
 from benchmarks.blind_trials.records import Board
 from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish_scoreboard, trial_table
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers
+from litho_data.sharing.workers import Workers
 
 # Announced before any of their trials is run; development uses other seeds.
 ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20271}

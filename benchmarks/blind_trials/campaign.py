@@ -14,7 +14,7 @@ from benchmarks.blind_trials.draws import draw_board
 from benchmarks.blind_trials.records import Board, Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
+from litho_data.sharing.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.virtual_fab.jobs import Plan
 
 _ROOT = Path(__file__).parents[2]

@@ -18,7 +18,7 @@ from litho_models.effects import CATALOGUE
 from litho_models.loop.errors import error_rows
 from litho_models.loop.record import CloseLoop
 from litho_models.models.physics import Physics
-from litho_models.scan_terms.groups import label_of
+from litho_models.scan_terms.grouped import label_of
 
 # A form that is right under the name of a family only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}

@@ -12,8 +12,8 @@ from benchmarks.blind_trials.judging import bias_of, false_names, found_by, judg
 from benchmarks.blind_trials.measured import inject, measured_jobs, middle
 from benchmarks.blind_trials.planting import plant, trial_jobs, write_raw
 from benchmarks.blind_trials.records import Draw, Draws, Outcome, Planted, Trial, TrialErrors
-from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_models.loop.run import close_loop
 

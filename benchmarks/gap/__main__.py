@@ -22,9 +22,9 @@ from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.plan import Effort, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
 from benchmarks.gap.tasks import chosen, tasks
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers
+from litho_data.sharing.workers import Workers
 from litho_models.frozen import zoo
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.printer import Printer

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import HERE, ONE_THREAD, Workers, run_jobs
+from litho_data.sharing.workers import HERE, ONE_THREAD, Workers, run_jobs
 
 _BIN = Path(sys.executable).parent
 

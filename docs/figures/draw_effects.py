@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts import random_layout
+from litho_data.reports.pictures import new_figure
 from litho_models.effects import CATALOGUE, Effect, FieldContext
 from litho_models.effects.chain import EffectChain
 from litho_models.models import build_model

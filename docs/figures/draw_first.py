@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from litho_data.foundation.commands import run_script
+from litho_data.commands.progress import run_script
 from litho_design import first, load_design, load_printer
 from litho_design.judging.gap import design_folder
 from litho_design.reports.first import DESIGNER, WITHOUT, draw_images, psnr_db

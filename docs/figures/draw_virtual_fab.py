@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 from litho_data.virtual_fab import KNOBS, Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard

@@ -46,7 +46,7 @@ print(store.quality[columns].round(3).to_string(index=False))
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 
 printed = store.scan(store.ids[0])
 figure = new_figure(9, 3.2)

@@ -30,7 +30,7 @@ for name, figures in judged.items():
 # The images, as the independent model prints both elements:
 
 # %%
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import new_figure
 
 printer = litho_design.load_printer("zoo:pbl", settings.layout)
 loaded = {name: litho_design.load_design(name) for name in designs}

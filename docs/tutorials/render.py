@@ -1,7 +1,8 @@
 """Run the tutorials and write their pages: `python docs/tutorials/render.py [NAME …]`.
 
 A tutorial is a script in cells (`# %%` code, `# %% [markdown]` words in comments). Its page shows the words, the
-code, and what the code printed and drew when it ran, in an empty folder, in one go.
+code, and what the code printed and drew when it ran, in an empty folder, in one go. Its notebook has the same
+cells, after one that installs the packages.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
+import json
 import os
 import re
 import sys
@@ -18,6 +20,9 @@ from typing import Any
 
 HERE = Path(__file__).parent
 NAMES = ("datasets", "models", "optics")
+_INSTALL = (
+    '# Where litholoop is installed already, this changes nothing.\n%pip install --quiet "litholoop[design]"'
+)
 # Progress and paths of the run, which say nothing to the reader.
 _NOISE = re.compile(r"^\s*(for comparison:|.*it/s)")
 
@@ -34,6 +39,31 @@ def cells(script: str) -> list[tuple[str, str]]:
     return found
 
 
+def notebook(script: str) -> dict[str, Any]:
+    """The script as a notebook (format 4.5) without outputs, its first cell the installation."""
+
+    def cell(number: int, kind: str, text: str) -> dict[str, Any]:
+        own: dict[str, Any] = {"outputs": [], "execution_count": None} if kind == "code" else {}
+        lines = text.splitlines(keepends=True)
+        return {"cell_type": kind, "id": f"cell-{number}", "metadata": {}, "source": lines, **own}
+
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    written = [("code", _INSTALL), *cells(script)]
+    return {
+        "cells": [cell(number, kind, text) for number, (kind, text) in enumerate(written)],
+        "metadata": {"kernelspec": kernel, "language_info": {"name": "python"}},
+        "nbformat": 4,
+        "nbformat_minor": 5,
+    }
+
+
+def write_notebook(name: str) -> None:
+    """Write ``NAME.ipynb`` beside the script."""
+    made = notebook((HERE / f"{name}.py").read_text("utf-8"))
+    text = json.dumps(made, indent=1, ensure_ascii=False)
+    (HERE / f"{name}.ipynb").write_text(text + "\n", encoding="utf-8")
+
+
 def run_cell(code: str, names: dict[str, Any]) -> tuple[str, Any]:
     """What a cell prints, and the value of its last expression; ``names`` are those of the cells before it."""
     tree = ast.parse(code)
@@ -47,7 +77,7 @@ def run_cell(code: str, names: dict[str, Any]) -> tuple[str, Any]:
 
 
 def render(name: str) -> None:
-    """Run one tutorial and write ``NAME.md`` and its figures ``NAME-1.svg`` … beside the script."""
+    """Run one tutorial and write ``NAME.md`` and its figures ``NAME-1.jpg`` … beside the script."""
     from matplotlib.figure import Figure
 
     names: dict[str, Any] = {}
@@ -72,10 +102,14 @@ def render(name: str) -> None:
                     page.append(f"```text\n{said}\n```")
         finally:
             os.chdir(here)
-    page.append(f"*This page is what [the script]({name}.py) printed and drew when `render.py` ran it.*")
+    page.append(
+        f"*This page is what [the script]({name}.py) printed and drew when `render.py` ran it; "
+        f"as a [notebook]({name}.ipynb).*"
+    )
     (HERE / f"{name}.md").write_text("\n\n".join(page) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
     for chosen in sys.argv[1:] or NAMES:
         render(chosen)
+        write_notebook(chosen)

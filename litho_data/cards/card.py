@@ -15,7 +15,7 @@ from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
-from litho_data.store.schema import Surround
+from litho_data.store.schema import Instrument, Surround
 
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
@@ -45,8 +45,10 @@ def with_tip(card: Card, tip: float | str) -> Card:
     """The card with another ``process.tip``.
 
     Raises:
-        InputError: neither a positive number nor ``blind``.
+        InputError: neither a positive number nor ``blind``, or micrographs, which no tip has made.
     """
+    if card.scan.instrument == "sem":
+        raise InputError("tip", got="micrographs", wanted="scans of an atomic force microscope")
     try:
         value = tip if tip == "blind" else float(tip)
         process = Process.model_validate({**card.process.model_dump(), "tip": value})
@@ -113,7 +115,8 @@ class LayoutFiles(Record):
     """What was sent to the printer.
 
     ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
-    255 / (levels - 1) where white is the highest level.
+    255 / (levels - 1) where white is the highest level. ``average_px``: the files are pictures in black and
+    white, of which squares of so many pixels a side become one, whose level counts the white ones.
     """
 
     files: FilePatterns
@@ -121,10 +124,22 @@ class LayoutFiles(Record):
     level_height_um: Length
     levels: int = Field(ge=2, le=256)
     grey_per_level: Length | None = None
+    average_px: int | None = Field(default=None, ge=2, le=15)
+
+    @model_validator(mode="after")
+    def _counted(self) -> Self:
+        if self.average_px is not None and self.levels != self.average_px**2 + 1:
+            raise ValueError(
+                f"wanted levels = {self.average_px**2 + 1}, the numbers of white pixels in a square"
+            )
+        return self
 
 
 class ScanFiles(Record):
     """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it.
+
+    ``instrument``: what kind of microscope. Of ``sem``, a scanning electron microscope, the files are
+    pictures of a film of the layout's full height, whose edges are measured.
 
     ``levelled``: whether the heights are to be taken as they are in the files.
     ``missing``: numbers and words that mark pixels which were not measured; an empty list says that there are
@@ -140,11 +155,15 @@ class ScanFiles(Record):
     full_scale_file: InsidePath | None = None
     levelled: bool = False
     missing: tuple[Annotated[float, Field(strict=True)] | str, ...] | None = None
+    instrument: Instrument = "afm"
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if self.full_scale_file is not None and self.unit is not None:
             raise ValueError("wanted either unit or full_scale_file, which is in metres")
+        given = (self.unit, self.full_scale_file, self.channel, self.missing)
+        if self.instrument == "sem" and (self.size_um is None or any(one is not None for one in given)):
+            raise ValueError("wanted size_um and nothing about heights: a micrograph has none")
         return self
 
 
@@ -252,6 +271,13 @@ class Card(Record):
     calibration: Calibration | None = None
     grating: KnownGrating | None = None
     source: Source | None = None
+
+    @model_validator(mode="after")
+    def _of_one_instrument(self) -> Self:
+        heights = (self.process.level, self.process.tip, self.calibration, self.grating)
+        if self.scan.instrument == "sem" and any(one is not None for one in heights):
+            raise ValueError("wanted no levelling, tip, calibration or grating of micrographs")
+        return self
 
 
 def _readable(error: ValidationError, what: str) -> InputError:

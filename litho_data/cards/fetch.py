@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from litho_data.cards.card import load_card
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.hashes import file_sha256
 

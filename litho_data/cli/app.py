@@ -10,7 +10,7 @@ import typer
 from litho_data.cli.layouts import masks, simulate
 from litho_data.cli.scan import inspect, level
 from litho_data.cli.tip import tip
-from litho_data.foundation.app import DaskOption, WorkersOption, argument, new_app, option, run_app
+from litho_data.commands.app import DaskOption, WorkersOption, argument, new_app, option, run_app
 
 app = new_app(
     "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
@@ -79,7 +79,7 @@ def build(
     Example: litho-data build prints/card.toml --out prints.zarr --workers 2
     """
     if suggest:
-        from litho_data.build.suggest import suggest_recipe
+        from litho_data.making.suggest import suggest_recipe
 
         folder = out.parent / f"{out.stem}-levelling"
         found = suggest_recipe(card, folder, data_dir=data_dir)
@@ -90,8 +90,8 @@ def build(
         typer.echo(f"suggested: {found.recipe}; build {found.card}")
         typer.echo(f"pictures {folder / 'report.html'}")
         return
-    from litho_data.build.build import build_dataset
-    from litho_data.build.result import report_folder
+    from litho_data.making.build import build_dataset
+    from litho_data.making.result import report_folder
 
     result = build_dataset(
         card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed, tip=tip
@@ -117,7 +117,7 @@ def calibrate(
 
     Example: litho-data calibrate prints/card.toml
     """
-    from litho_data.build.calibration import calibrate as scales_of
+    from litho_data.making.calibration import calibrate as scales_of
 
     for axis, scale in scales_of(card, data_dir).items():
         percent = 100 * (scale.factor - 1)
@@ -220,8 +220,8 @@ def import_pairs(
 
     Example: litho-data import-pairs pairs --out pairs.zarr
     """
-    from litho_data.build.result import report_folder
     from litho_data.exchange.pairs import import_pairs as build_from_pairs
+    from litho_data.making.result import report_folder
 
     target = out or folder.resolve().with_suffix(".zarr")
     result = build_from_pairs(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from litho_data.foundation.app import option
+from litho_data.commands.app import option
 
 
 def _list_patterns(wanted: bool) -> None:

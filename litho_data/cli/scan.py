@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from litho_data.foundation.app import argument, option
+from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX
 from litho_data.readers.registry import formats

@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.kinds import Array
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.pictures import limits, new_figure
 from litho_data.scan import Scan
 
 _COLOURS = "viridis"
-_PERCENTILES = (0.5, 99.5)
 
 
 def write_picture(scan: Scan, path: str | Path) -> Path:
@@ -21,7 +19,7 @@ def write_picture(scan: Scan, path: str | Path) -> Path:
     unit, pitch = ("µm", scan.pitch_um) if scan.pitch_um is not None else ("px", (1.0, 1.0))
     figure = new_figure(6.4, 5.2)
     axes = figure.add_subplot()
-    low, high = _limits(scan.height_um * 1e3)
+    low, high = limits(scan.height_um * 1e3)
     image = axes.imshow(
         scan.height_um * 1e3,
         extent=(0, nx * pitch[1], ny * pitch[0], 0),
@@ -45,9 +43,3 @@ def write_picture(scan: Scan, path: str | Path) -> Path:
     with atomic_file(target) as temporary:
         figure.savefig(temporary, format="png", dpi=150, bbox_inches="tight")
     return target
-
-
-def _limits(height: Array) -> tuple[float, float]:
-    """Limits that do not depend on a few outliers."""
-    low, high = np.nanpercentile(height, _PERCENTILES)
-    return float(low), float(high)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from litho_data.cli.scan import ChannelName, Format, FullScale, Missing, Size, Unit, marks
-from litho_data.foundation.app import argument, option
+from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,7 +85,6 @@ def _text(found: TipEstimate) -> str:
     else:
         lines = [f"radius at most {value} µm: {found.reason}"]
     lines += [
-        f"flanks at most {found.full_angle_deg:.0f}° apart",
         f"heights over {found.depth_um:.3g} µm, noise {found.pixel_noise_nm:.2g} nm per pixel and "
         f"{found.line_noise_nm:.2g} nm per line",
     ]

@@ -13,22 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.build.assemble import Source
-from litho_data.build.build import make_store
-from litho_data.build.operations import OPERATIONS
-from litho_data.build.quality import noise_figures
-from litho_data.build.result import BuildResult
 from litho_data.cards.card import Card, check_card
 from litho_data.cards.listing import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
-from litho_data.foundation.workers import Workers
+from litho_data.making.assemble import Source
+from litho_data.making.build import make_store
+from litho_data.making.operations import OPERATIONS
+from litho_data.making.result import BuildResult
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
+from litho_data.sharing.workers import Workers
 from litho_data.store.partial import Piece
 from litho_data.store.read import open_store
 
@@ -131,7 +130,7 @@ class PairsJob:
             "order": self.order,
             "columns": {},
             "steps": [done.step.to_record()],
-            "quality": noise_figures(done.arrays["raw_height_um"]) | {"valid_fraction": 1.0},
+            "quality": {"valid_fraction": 1.0},
             "read": {"pitch_um": [pitch_um, pitch_um]},
             "software": software_record(),
         }

@@ -5,8 +5,8 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
@@ -25,41 +27,45 @@ def let_waiting_threads_sleep() -> None:
         os.environ.setdefault(variable, value)
 
 
-def lazy_face(
-    package: str, homes: Mapping[str, str]
-) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
-    In a package's ``__init__``, where type checkers read the imports and Python the mapping::
+    In a package's ``__init__``, whose imports type checkers follow and Python reads as a list::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan
         else:
-            __all__, __getattr__, __dir__ = lazy_face(__name__, {"read_scan": "litho_data.readers.read"})
+            __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
 
     Args:
-        package: ``__name__`` of the package.
-        homes: per public name the module that ``from module import name`` takes it from, or
-            ``"module:other"`` where it has another name there. A public name must not be that of a room of
-            the package, because importing a room binds its name.
+        package: ``__name__`` of the package. A public name must not be that of a room of the package, because
+            importing a room binds its name.
+        file: its ``__init__``; every import with ``as`` in it is a public name.
 
     ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.
     """
+    homes = {
+        alias.asname: (str(node.module), alias.name)
+        for node in ast.walk(ast.parse(Path(file).read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname
+    }
 
     def load(name: str) -> Any:
         if name == "__version__":
             value: Any = _version()
         elif name in homes:
             let_waiting_threads_sleep()
-            module, _, inner = homes[name].partition(":")
+            module, inner = homes[name]
             try:
-                home = __import__(module, fromlist=[inner or name])
+                home = __import__(module, fromlist=[inner])
             except ModuleNotFoundError as error:
                 if error.name != _OF_EXTRAS:
                     raise
                 extra = package.removeprefix("litho_")
                 raise ModuleNotFoundError(f"{package}.{name} {_missing(extra)}", name=error.name) from None
-            value = getattr(home, inner or name)
+            value = getattr(home, inner)
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         setattr(sys.modules[package], name, value)

@@ -53,9 +53,9 @@ def canonical_json(record: Any) -> str:
 
 
 def source_sha256(*paths: Path) -> str:
-    """Hash of Python source files; a folder stands for all ``.py`` files below it, in sorted order."""
+    """Hash of source files; a folder stands for all of Python and TOML below it, in sorted order."""
     digest = hashlib.sha256()
     for path in paths:
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+        for file in sorted([*path.rglob("*.py"), *path.rglob("*.toml")]) if path.is_dir() else [path]:
             digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()

@@ -40,20 +40,6 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         )
 
 
-def require_same_settings(path: str | Path, record: str, settings: Mapping[str, Any]) -> None:
-    """Refuse a folder whose result, if there is one, was made with other settings.
-
-    Args:
-        path: where the result will be.
-        record: the file that a finished result holds.
-        settings: fields of that file, with the values that they will have now.
-
-    Raises:
-        InputError: another value, which the message names.
-    """
-    require_same(Path(path), read_record(Path(path) / record), settings)
-
-
 def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
     """Refuse a folder whose record, of a result finished or begun, holds other facts than these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
@@ -78,9 +64,7 @@ def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str 
     return ""
 
 
-def require_own_folder(
-    path: str | Path, record: str, *begun: str, subject: Mapping[str, object] | None = None
-) -> None:
+def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     """Accept a folder for the result with the record file ``record``: a free or empty one, or its own.
 
     A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
@@ -90,8 +74,6 @@ def require_own_folder(
         path: where the result will be; what else lies in a folder of its own is left alone.
         record: the file that a finished result holds.
         begun: names, or patterns of names, of what an interrupted run of the same kind leaves.
-        subject: what the result will be of, by dotted names in the record, such as ``dataset.name``; an
-            older result there has to be of the same.
 
     Raises:
         InputError: a file, or a folder with another result or with something else in it.
@@ -111,28 +93,6 @@ def require_own_folder(
             wanted="a new folder, or one of this command alone",
             hint="" if store else f"for example {folder / Path(record).stem}",
         )
-    require_same_subject(folder / record, subject or {})
-
-
-def require_same_subject(record: Path, subject: Mapping[str, object]) -> None:
-    """Refuse a folder whose result, if there is one, is of something else than ``subject`` says.
-
-    Raises:
-        InputError: another dataset, model or design.
-    """
-    held = read_record(record)
-    for name, asked in subject.items():
-        found = held
-        for part in name.split("."):
-            found = found.get(part) if isinstance(found, dict) else None
-        if found is not None and found != asked:
-            what = name.removesuffix(".name")
-            raise InputError(
-                "output",
-                got=f"{record.parent}, which holds a result of {what} {found}",
-                wanted=f"a folder for {what} {asked}",
-                hint="choose another --out",
-            )
 
 
 def _refuse_a_file(folder: Path) -> None:

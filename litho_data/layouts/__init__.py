@@ -12,14 +12,12 @@ from litho_data.layouts.patterns import (
     step_ladder,
 )
 from litho_data.layouts.random_layout import random_layout
-from litho_data.layouts.statistics import Departure, LayoutStatistics, departure, layout_statistics
+from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 
 __all__ = [
     "PATTERNS",
-    "Departure",
     "LayoutStatistics",
     "checkerboard",
-    "departure",
     "flat",
     "framed_ladder",
     "isolated_features",

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.kinds import Array
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts.statistics import LayoutStatistics
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

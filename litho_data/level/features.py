@@ -17,7 +17,7 @@ from litho_data.level.polynomial import (
     polynomial_terms,
     robust_surface,
 )
-from litho_data.level.selection import MaskedLevelling, Masking, as_height, select, subtract
+from litho_data.level.selection import MaskedLevelling, subtract
 
 Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
@@ -29,13 +29,12 @@ _LEAST_BACKGROUND = 0.02
 
 @operation("mark-features")
 def mark_features(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     threshold: Threshold = 3.0,
     side: Side = "both",
     grow_px: Grown = 0,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Array:
     """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
 
@@ -44,7 +43,7 @@ def mark_features(
     result is everything that later steps should exclude.
 
     Args:
-        height: (ny, nx), any unit, already level.
+        z: (ny, nx), any unit, already level.
         grow_px: the marked area is widened by this many pixels, to cover blurred edges.
 
     Returns:
@@ -53,8 +52,6 @@ def mark_features(
     Raises:
         InputError: a threshold that is not positive, an unknown side, a negative ``grow_px``.
     """
-    z = as_height(height)
-    chosen = select(z, mask, masking)
     values = z if chosen is None else z[chosen]
     centre = float(np.median(values))
     usable = np.isfinite(z) if chosen is None else chosen
@@ -64,7 +61,8 @@ def mark_features(
 
 @operation("mask-and-relevel")
 def mask_and_relevel(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     x_degree: Degree = 1,
     y_degree: Degree = 1,
@@ -72,8 +70,6 @@ def mask_and_relevel(
     threshold: Threshold = 3.0,
     side: Side = "both",
     grow_px: Grown = 2,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> MaskedLevelling:
     """Level, mark the features, level again without them, until the marks no longer change.
 
@@ -84,9 +80,7 @@ def mask_and_relevel(
     Raises:
         InputError: parameters outside their range, or features that leave no background.
     """
-    z = as_height(height)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
-    chosen = select(z, mask, masking)
     usable = np.isfinite(z) if chosen is None else chosen
     surface = robust_surface(z, chosen, terms)
     # The noise is estimated once: estimated again over the remaining pixels, it would shrink every round.
@@ -97,7 +91,7 @@ def mask_and_relevel(
         background = usable & ~features
         if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(usable):
             raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
-        surface = evaluate(fit_terms(z, background.astype(float), terms), z.shape)
+        surface = evaluate(fit_terms(z, background, terms), z.shape)
         key = np.packbits(features).tobytes()
         if key in seen:
             break

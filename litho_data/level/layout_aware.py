@@ -12,7 +12,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, subtract
+from litho_data.register.topography import smooth_measured
 
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
@@ -26,15 +27,14 @@ _LEAST_INSIDE = 0.25
 
 @operation("layout-aware")
 def level_layout_aware(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     layout_level: Array,
     blur_px: Annotated[float, Field(ge=0)] | None = None,
     x_degree: Degree = 1,
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the background that remains once the layout has explained what it can.
 
@@ -44,7 +44,7 @@ def level_layout_aware(
     over the fitted pixels: the datum is part of the response.
 
     Args:
-        height: (ny, nx), any unit.
+        z: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
         blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that
@@ -56,20 +56,21 @@ def level_layout_aware(
         InputError: a layout of another shape or without overlap, or a layout that looks like the
             background itself, such as a ramp, so that the two cannot be separated.
     """
-    z = as_height(height)
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
     if not terms:
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
     blurs = _BLURS_PX if blur_px is None else (blur_px,)
-    inside = _inside(np.isfinite(layout_level), 2 * blurs[-1])
-    chosen = select(z, mask, masking)
+    known = np.isfinite(layout_level)
+    inside = _inside(known, 2 * blurs[-1])
     fitted = inside if chosen is None else chosen & inside
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
     level = np.asarray(layout_level, dtype=float)
-    fits = [_joint_fit(z, _blur(level, blur), fitted, terms) for blur in blurs]
+    fits = [
+        _joint_fit(z, np.where(known, smooth_measured(level, blur), np.nan), fitted, terms) for blur in blurs
+    ]
     surface = evaluate(min(fits, key=lambda fit: fit[1])[0], z.shape)
     return subtract(z, surface - surface[fitted].mean())
 
@@ -113,16 +114,6 @@ def layout_in_scan_frame(
     levels = np.full(scan_shape, np.nan)
     levels[inside] = layout_level[row[inside], column[inside]]
     return levels
-
-
-def _blur(level: Array, sigma_px: float) -> Array:
-    """Gaussian blur over the known pixels only; unknown ones stay unknown."""
-    if sigma_px == 0:
-        return level
-    known = np.isfinite(level)
-    weight = ndimage.gaussian_filter(known.astype(float), sigma_px)
-    spread = ndimage.gaussian_filter(np.where(known, level, 0.0), sigma_px)
-    return np.where(known, spread / np.where(weight > 0, weight, 1.0), np.nan)
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:

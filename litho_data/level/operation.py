@@ -4,16 +4,16 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any, ClassVar, Literal, TypeVar, cast
+from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import first_error
-from litho_data.level.selection import MaskedLevelling, Masking
+from litho_data.level.selection import MaskedLevelling, Masking, as_height, select
 
-F = TypeVar("F", bound=Callable[..., Any])
+R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The steps that a recipe can hold, by operation."""
 
@@ -52,22 +52,24 @@ class Step(BaseModel):
             if arguments[name] is None and not optional:
                 wanted = "the pixel pitch" if name == "pitch_um" else "the layout in the scan's frame"
                 raise InputError(f"{wanted} is unknown", wanted=name)
-        made = type(self).function(state.height_um, **arguments)
+        made = type(self).function(state.height_um, mask=state.mask, **arguments)
         if isinstance(made, Array):
             return replace(state, mask=made)
         levelled, mask = made if isinstance(made, MaskedLevelling) else (made, state.mask)
         return replace(state, height_um=levelled.height, mask=mask)
 
 
-def operation(op: str, base: type[Step] = Step) -> Callable[[F], F]:
-    """Make a function of a height map the operation of that name, and check the arguments of every call.
+def operation(op: str, base: type[Step] = Step) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Make a function of heights and of the pixels that it may use the operation of that name.
 
-    Keyword arguments that ``State`` has are taken from there; all others are the fields of the step. The
-    function returns a ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
+    The function gets float64 (ny, nx), and bool (ny, nx) or None for all pixels; it is called with a map of
+    any type, a ``mask`` and ``masking``, see ``select``. Of its keyword arguments those that ``State`` has
+    are taken from there, all others are fields of the step, checked at every call. It returns a ``Levelled``,
+    a ``MaskedLevelling``, or pixels to mark as a bool array.
     """
 
-    def made(function: F) -> F:
-        _, *parameters = inspect.signature(function, eval_str=True).parameters.values()
+    def made(function: Callable[..., R]) -> Callable[..., R]:
+        _, _, *parameters = inspect.signature(function, eval_str=True).parameters.values()
         fields: dict[str, Any] = {"op": (Literal[op], op)}
         takes = {}
         for one in parameters:
@@ -76,19 +78,28 @@ def operation(op: str, base: type[Step] = Step) -> Callable[[F], F]:
                 takes[one.name] = not required
             elif one.name != "masking":
                 fields[one.name] = one.annotation, ... if required else one.default
+        knows_masking = any(one.name == "masking" for one in parameters)
+
+        def run(height: Array, mask: Array | None, masking: Masking, **arguments: Any) -> R:
+            z = as_height(height)
+            arguments |= {"masking": masking} if knows_masking else {}
+            return function(z, select(z, mask, masking), **arguments)
+
         step = create_model(op, __base__=base, **fields)
-        step.function, step.takes = staticmethod(function), takes
+        step.function, step.takes = staticmethod(run), takes
         STEPS[op] = step
 
         @wraps(function)
-        def checked(height: Array, **arguments: Any) -> Any:
+        def checked(
+            height: Array, *, mask: Array | None = None, masking: Masking = "exclude", **arguments: Any
+        ) -> R:
             stated = {name: value for name, value in arguments.items() if name not in takes}
             try:
-                step(op=op, **stated)
+                step(op=op, masking=masking, **stated)
             except ValidationError as error:
                 raise InputError(op, got=first_error(error)) from error
-            return function(height, **arguments)
+            return run(height, mask, masking, **arguments)
 
-        return cast(F, checked)
+        return checked
 
     return made

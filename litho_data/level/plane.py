@@ -10,13 +10,13 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Terms, fit_terms
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
+from litho_data.level.selection import Levelled, subtract, subtract_product
 
 PLANE: Terms = ((0, 0), (1, 0), (0, 1))
 
 
 @operation("plane")
-def level_plane(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
+def level_plane(z: Array, chosen: Array | None) -> Levelled:
     """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
 
     Gwyddion's definition: the fitted constant is replaced by -(bx nx + by ny) / 2, slopes in height per
@@ -25,21 +25,17 @@ def level_plane(height: Array, *, mask: Array | None = None, masking: Masking = 
     Raises:
         InputError: the selected pixels do not determine a plane. (Gwyddion then removes nothing.)
     """
-    z = as_height(height)
-    chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(float)
-    return subtract_tilt(z, slopes_per_px(fit_terms(z, weights, PLANE), z.shape))
+    return subtract_tilt(z, slopes_per_px(fit_terms(z, chosen, PLANE), z.shape))
 
 
 @operation("three-point")
 def level_three_point(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     points_px: tuple[YX, YX, YX],
     radius_px: Annotated[float, Field(ge=0)] = 0.0,
     set_zero: bool = False,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the plane through three points, each the mean over a disc.
 
@@ -52,8 +48,6 @@ def level_three_point(
     Raises:
         InputError: not three points, a disc without a selected pixel, or points on one line.
     """
-    z = as_height(height)
-    chosen = select(z, mask, masking)
     heights = [_disc_mean(z, chosen, point, radius_px) for point in points_px]
     design = np.array([[1.0, x, y] for y, x in points_px])
     if abs(np.linalg.det(design)) < 1e-9 * z.size:
@@ -93,11 +87,10 @@ def _disc_mean(z: Array, chosen: Array | None, point: YX, radius: float) -> floa
 
 @operation("rotate")
 def level_rotate(
-    height_um: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     pitch_um: YX,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Rotate by the angles of the least-squares plane, first every row, then every column.
 
@@ -106,18 +99,15 @@ def level_rotate(
     positions; what turns out of the image is continued by the outermost value.
 
     Args:
-        height_um: (ny, nx), µm; every pixel must be measured.
+        z: (ny, nx), µm; every pixel must be measured.
         pitch_um: (y, x) sampling, µm, in the unit of the heights.
 
     Raises:
         InputError: missing pixels, or an angle at which the surface would overhang.
     """
-    z = as_height(height_um)
     if not np.isfinite(z).all():
         raise InputError("rotation of a scan with missing pixels", wanted="every pixel measured")
-    chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(float)
-    slope_x, slope_y = slopes_per_px(fit_terms(z, weights, PLANE), z.shape)
+    slope_x, slope_y = slopes_per_px(fit_terms(z, chosen, PLANE), z.shape)
     turned = _rotate_rows(z, slope_x / pitch_um[1], pitch_um[1])
     turned = _rotate_rows(turned.T, slope_y / pitch_um[0], pitch_um[0]).T
     return Levelled(np.ascontiguousarray(turned), z - turned)
@@ -139,28 +129,24 @@ def _rotate_rows(z: Array, slope: float, pitch_um: float) -> Array:
 
 
 @operation("fix-zero")
-def fix_zero(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
+def fix_zero(z: Array, chosen: Array | None) -> Levelled:
     """Move the lowest selected pixel to zero. This is the height of one pixel, not a physical datum."""
-    return _shift(height, np.min, mask, masking)
+    return _shift(z, np.min, chosen)
 
 
 @operation("zero-mean")
-def zero_mean(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
+def zero_mean(z: Array, chosen: Array | None) -> Levelled:
     """Move the mean of the selected pixels to zero."""
-    return _shift(height, np.mean, mask, masking)
+    return _shift(z, np.mean, chosen)
 
 
 @operation("zero-max")
-def zero_max(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
+def zero_max(z: Array, chosen: Array | None) -> Levelled:
     """Move the highest selected pixel to zero."""
-    return _shift(height, np.max, mask, masking)
+    return _shift(z, np.max, chosen)
 
 
-def _shift(
-    height: Array, statistic: Callable[[Array], float], mask: Array | None, masking: Masking
-) -> Levelled:
-    z = as_height(height)
-    chosen = select(z, mask, masking)
+def _shift(z: Array, statistic: Callable[[Array], float], chosen: Array | None) -> Levelled:
     return subtract(z, np.broadcast_to(np.float64(statistic(z if chosen is None else z[chosen])), z.shape))
 
 
@@ -173,11 +159,10 @@ _FEWEST_CELLS = 4
 
 @operation("facet")
 def level_facet(
-    height_um: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     pitch_um: YX,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) stays.
 
@@ -186,14 +171,12 @@ def level_facet(
     sqrt(1e-9).
 
     Args:
-        height_um: (ny, nx), µm: slopes are physical, so height and pitch must share a unit.
+        z: (ny, nx), µm: slopes are physical, so height and pitch must share a unit.
         pitch_um: (y, x) sampling, µm.
 
     Raises:
         InputError: fewer than 4 usable cells. (Gwyddion then removes nothing.)
     """
-    z = as_height(height_um)
-    chosen = select(z, mask, masking)
     slope_x, slope_y = _cell_slopes(z, chosen, pitch_um)
     if slope_x.size < _FEWEST_CELLS:
         raise InputError(

@@ -10,7 +10,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.level.operation import operation
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
+from litho_data.level.selection import Levelled, subtract, subtract_product
 
 Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
@@ -22,13 +22,12 @@ _WELL_CONDITIONED = 1e3
 
 @operation("polynomial")
 def level_polynomial(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     x_degree: Degree = 3,
     y_degree: Degree = 3,
     total_degree: Degree | None = None,
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the least-squares polynomial, its constant included.
 
@@ -37,17 +36,13 @@ def level_polynomial(
     it, p + q <= total_degree and the other two degrees do not count (limited total degree).
 
     Args:
-        height: (ny, nx), any unit.
-        mask: bool (ny, nx).
+        z: (ny, nx), any unit.
 
     Raises:
         InputError: a degree outside 0..11, or selected pixels that do not determine all terms.
     """
-    z = as_height(height)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
-    chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(float)
-    return subtract_product(z, *surface_factors(fit_terms(z, weights, terms), z.shape))
+    return subtract_product(z, *surface_factors(fit_terms(z, chosen, terms), z.shape))
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
@@ -70,11 +65,12 @@ def fit_terms(z: Array, weights: Array | None, terms: Terms) -> Array:
 
     Args:
         z: (ny, nx); NaN only where the weight is zero.
-        weights: (ny, nx), not negative; None for one everywhere.
+        weights: (ny, nx), not negative, or the pixels that count one; None for one everywhere.
 
     Raises:
         InputError: the weighted pixels do not determine all terms.
     """
+    weights = None if weights is None else np.asarray(weights, float)
     powers_x, powers_y = [p for p, _ in terms], [q for _, q in terms]
     basis_x = _basis(z.shape[1], max(powers_x))
     basis_y = _basis(z.shape[0], max(powers_y))
@@ -166,14 +162,13 @@ _SETTLED = 1e-7
 
 @operation("robust")
 def level_robust(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     x_degree: Degree = 1,
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
     loss: Loss = "tukey",
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the robust polynomial with its constant: the main surface then lies at zero.
 
@@ -181,15 +176,14 @@ def level_robust(
     weight to distant features and starts from the Huber solution, which has a single minimum.
 
     Args:
-        height: (ny, nx), any unit.
+        z: (ny, nx), any unit.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
         InputError: an unknown loss, or pixels that do not determine the polynomial.
     """
-    z = as_height(height)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
-    return subtract(z, robust_surface(z, select(z, mask, masking), terms, loss))
+    return subtract(z, robust_surface(z, chosen, terms, loss))
 
 
 def robust_surface(z: Array, chosen: Array | None, terms: Terms, loss: Loss = "tukey") -> Array:

@@ -18,7 +18,7 @@ from litho_data.level.row_statistics import (
     row_modus,
     row_trimmed_mean,
 )
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, Masking, subtract
 
 RowMethod = Literal[
     "median",
@@ -52,20 +52,20 @@ class _Aligned(Step):
 
 @operation("align-rows", _Aligned)
 def align_rows(
-    height_um: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     method: RowMethod = "median",
     direction: Direction = "horizontal",
     degree: Annotated[int, Field(ge=0, le=5)] = 1,
     trim: Annotated[float, Field(ge=0, le=MEDIAN_TRIM)] = 0.05,
     pitch_um: YX | None = None,
-    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Remove from each scan line what it does not share with the others.
 
     Args:
-        height_um: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
+        z: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
             first compare a squared height with a height, in metres as Gwyddion does, and the second
             chooses between equally short windows as Gwyddion does in metres.
         method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
@@ -80,10 +80,8 @@ def align_rows(
     Raises:
         InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
     """
-    z = as_height(height_um)
     if method == "facet-tilt" and pitch_um is None:
         raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
-    chosen = select(z, mask, masking)
     if direction == "vertical":
         columns = None if chosen is None else np.ascontiguousarray(chosen.T)
         pitch = None if pitch_um is None else (pitch_um[1], pitch_um[0])

@@ -5,13 +5,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy import ndimage, sparse
-from scipy.sparse import linalg
+from scipy import ndimage
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.level.operation import operation
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, as_height, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
 Threshold = Annotated[float, Field(gt=0)]
@@ -20,15 +19,14 @@ Count = Annotated[int, Field(ge=1)]
 
 @operation("mark-scars")
 def mark_scars(
-    height: Array,
+    z: Array,
+    chosen: Array | None,
     *,
     high: Threshold = 0.666,
     low: Threshold = 0.25,
     min_length_px: Count = 16,
     max_width_px: Count = 4,
     sign: ScarSign = "both",
-    mask: Array | None = None,
-    masking: Masking = "exclude",
 ) -> Array:
     """Mark strokes along the rows that stand out from the rows above and below them.
 
@@ -44,10 +42,8 @@ def mark_scars(
     Raises:
         InputError: thresholds or sizes outside their range, or an unknown sign.
     """
-    z = as_height(height)
     if low > high:
         raise InputError("scar parameters", got=f"low {low}, high {high}", wanted="low up to high")
-    chosen = select(z, mask, masking)
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
     scars = np.zeros(z.shape, dtype=bool)
@@ -81,8 +77,8 @@ def remove_scars(height: Array, *, scars: Array) -> Levelled:
 
 @operation("remove-scars")
 @wraps(mark_scars)
-def _fill_scars(height: Array, **how: Any) -> Levelled:
-    return remove_scars(height, scars=mark_scars(height, **how))
+def _fill_scars(z: Array, chosen: Array | None, **how: Any) -> Levelled:
+    return remove_scars(z, scars=mark_scars(z, mask=chosen, masking="include", **how))
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
@@ -111,27 +107,16 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Values of the unknown pixels, in the order of ``z[unknown]``."""
-    n = int(np.count_nonzero(unknown))
-    index = np.full(z.shape, -1)
-    index[unknown] = np.arange(n)
-    known = np.isfinite(z) & ~unknown
-    coupling, right, anchors = np.zeros(n), np.zeros(n), np.zeros(n)
-    pairs = []
-    every, first, last = slice(None), slice(None, -1), slice(1, None)
-    for here, there in (((first, every), (last, every)), ((every, first), (every, last))):
-        for a, b in ((here, there), (there, here)):
-            inside, border = unknown[a] & unknown[b], unknown[a] & known[b]
-            pairs.append((index[a][inside], index[b][inside]))
-            np.add.at(coupling, index[a][inside], 1.0)
-            np.add.at(anchors, index[a][border], 1.0)
-            np.add.at(right, index[a][border], z[b][border])
-    labels, count = ndimage.label(unknown)
-    anchored = np.bincount(labels[unknown], weights=anchors, minlength=count + 1)[1:]
-    if (anchored == 0).any():
+    """Values of the unknown pixels, in the order of ``z[unknown]``; what was not measured is filled along."""
+    from SurfaceTopography import Topography
+
+    left_out = unknown | ~np.isfinite(z)
+    areas, _ = ndimage.label(left_out)
+    beside = ndimage.binary_dilation(~left_out)
+    if set(np.unique(areas[unknown])) - set(np.unique(areas[beside & left_out])):
         raise InputError(
             "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
         )
-    rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    links = sparse.csc_matrix((-np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    return linalg.spsolve(links + sparse.diags(coupling + anchors, format="csc"), right)
+    known = Topography(np.ma.masked_array(z, left_out), z.shape)
+    filled: Array = known.interpolate_undefined_data_with_harmonic_function().heights()
+    return filled[unknown]

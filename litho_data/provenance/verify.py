@@ -8,11 +8,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from litho_data.build.assemble import root_attributes, table_sha256
-from litho_data.build.operations import OPERATIONS
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.making.assemble import root_attributes, table_sha256
+from litho_data.making.operations import OPERATIONS
 from litho_data.provenance.history import Recorded, raw_folder, read_steps, require_folder, stored_array
 from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
 from litho_data.store.contract import file_names, missing_files, read_documents

@@ -247,6 +247,12 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str
     )
 
 
+def lines_and_numbers(held: Mapping[str, Array]) -> tuple[dict[str, Coordinate], dict[str, Any]]:
+    """Of arrays by name those along one dimension, as coordinates, and the single values."""
+    lines = {name: Coordinate(one.ravel().astype(float), None) for name, one in held.items() if _is_line(one)}
+    return lines, {name: one.ravel()[0] for name, one in held.items() if one.size == 1}
+
+
 def _is_line(array: Any) -> bool:
     """Whether an array holds numbers along one dimension; MATLAB's have two."""
     return array.dtype.kind in _NUMBERS and array.size > 1 and max(array.shape) == array.size
@@ -312,10 +318,9 @@ def read_matlab(path: Path) -> list[Channel]:
     with foreign_parser(path, "MATLAB"):
         held = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
     maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
-    lines = {name: Coordinate(one.ravel().astype(float), None) for name, one in held.items() if _is_line(one)}
-    around = {name: one.ravel()[0] for name, one in held.items() if one.size == 1}
+    beside = lines_and_numbers(held)
     named = (
-        (name, partial(_in_memory, name, one, {}, ("", ""), lines, around))
+        (name, partial(_in_memory, name, one, {}, ("", ""), *beside))
         for name, one in maps.items()
         if one.dtype.kind in "uifc"
     )

@@ -7,15 +7,20 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.readers.exported import export_of, exported_levels
-from litho_data.readers.npy import load_array
-from litho_data.readers.registry import PICTURE, detect_format, require_file
-from litho_data.readers.tiff import open_tiff, require_upright, single_sample
+from litho_data.readers.picture import read_picture, value_range
+from litho_data.readers.registry import require_file
 
 _LARGEST_LEVEL = 255
 _WHITE = (255, 65535)
 
 
-def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels: int | None = None) -> Array:
+def read_layout(
+    path: str | Path,
+    *,
+    grey_per_level: float | None = None,
+    levels: int | None = None,
+    average_px: int | None = None,
+) -> Array:
     """Levels of a layout, uint8 (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
@@ -27,6 +32,9 @@ def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels
         grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
         levels: how many there are. A picture whose values go beyond them is then taken for one whose white is
             the highest level, if all its values are steps of it.
+        average_px: of a picture in two greys: the side of the squares of its pixels that become one pixel of
+            the layout, whose level is the number of pixels in the lighter grey; what is left over at right
+            and bottom is cut.
 
     Raises:
         InputError: no such file, damaged, another format, a true colour image, values that are no levels or
@@ -35,15 +43,9 @@ def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels
     file = require_file(path)
     if says := export_of(file):
         return exported_levels(file, says)
-    kind = detect_format(file)
-    readers = {"tiff": _tiff_pixels, "npy": load_array, PICTURE: _image_pixels}
-    if kind not in readers:
-        raise InputError(f"layout {file}: format", got=kind, wanted="TIFF, PNG, BMP or NPY")
-    pixels = single_sample(file, np.asarray(readers[kind](file)))
-    if pixels.size == 0:
-        raise InputError(f"layout {file}: shape", got=pixels.shape, wanted="at least one pixel")
-    if pixels.dtype.kind not in "uif" or not np.isfinite(pixels).all():
-        raise InputError(f"layout {file}: values", got=_range(pixels), wanted="integer levels from 0 to 255")
+    pixels = read_picture(file, "layout")
+    if average_px is not None:
+        return _averaged(file, pixels, average_px)
     step = grey_per_level or _white_step(pixels, levels)
     found = np.rint(pixels / step)
     if (
@@ -51,8 +53,20 @@ def read_layout(path: str | Path, *, grey_per_level: float | None = None, levels
         or not 0 <= found.min() <= found.max() <= _LARGEST_LEVEL
     ):
         wanted = "integer levels from 0 to 255" if step == 1 else f"steps of {step:g} per level"
-        raise InputError(f"layout {file}: values", got=_range(pixels), wanted=wanted)
+        raise InputError(f"layout {file}: values", got=value_range(pixels), wanted=wanted)
     return found.astype(np.uint8)
+
+
+def _averaged(file: Path, pixels: Array, side: int) -> Array:
+    """Numbers of light pixels in squares of a picture in two greys."""
+    ny, nx = (length // side for length in pixels.shape)
+    greys = np.unique(pixels)
+    if len(greys) > 2 or not ny * nx:
+        wanted = f"two greys, and {side} x {side} px at least"
+        raise InputError(f"layout {file}", got=f"{len(greys)} greys, {pixels.shape} px", wanted=wanted)
+    light = (pixels == greys[-1]) & (greys[-1] > 0)
+    squares = light[: ny * side, : nx * side].reshape(ny, side, nx, side)
+    return squares.sum(axis=(1, 3)).astype(np.uint8)
 
 
 def _white_step(pixels: Array, levels: int | None) -> float:
@@ -64,29 +78,3 @@ def _white_step(pixels: Array, levels: int | None) -> float:
         if step > 1 and on_steps and np.rint(pixels.max() / step) <= levels - 1:
             return step
     return 1.0
-
-
-def _tiff_pixels(path: Path) -> Array:
-    with open_tiff(path) as file:
-        if len(file.pages) != 1:
-            raise InputError(f"layout {path}: pages", got=len(file.pages), wanted="one image")
-        require_upright(path, file.pages.first)
-        return file.pages.first.asarray()
-
-
-def _image_pixels(path: Path) -> Array:
-    import cv2
-
-    try:
-        pixels = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise InputError(f"cannot read {path} as an image", got=str(error)) from error
-    if pixels is None:
-        raise InputError(f"cannot read {path} as an image", wanted="an undamaged PNG or BMP")
-    return pixels
-
-
-def _range(pixels: Array) -> str:
-    if pixels.dtype.kind not in "uif":
-        return str(pixels.dtype)
-    return f"{pixels.dtype} from {pixels.min():g} to {pixels.max():g}"

@@ -8,13 +8,9 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.readers.reader import Channel
+from litho_data.readers.text_blocks import WORDS
 
-# What programs write where nothing was measured.
-_USUAL = np.array([
-    -999, 9999, 99999, 999999, 32766, 32767, -32768, 65535, 2147483647, 1.70141e38, 3.4028235e38, 9.96921e36,
-    1e20, 1e30, 1e31, 1e37, 1e38, 1e100, 1.7976931e308, -9999, -99999, -1.70141e38, -3.4028235e38,
-    -2147483648, -1e30, -1e37, -1e38, -1e100, -1.7976931e308,
-])  # fmt: skip
+_USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
 # A number that no program is known for must stand this many spans of the other values away; one pixel, more.
 _FAR, _FAR_ALONE = 10, 1000

@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array, Shape
-from litho_data.readers.arrays import Coordinate, array_channel, refuse_mask
+from litho_data.readers.arrays import array_channel, lines_and_numbers, refuse_mask
 from litho_data.readers.reader import (
     MOST_BYTES_PER_PACKED_BYTE,
     Channel,
@@ -62,9 +62,7 @@ def read_archive(path: Path) -> list[Channel]:
                 masks[shape] = name
             elif len(shape) < 2 and not dtype.hasobject:
                 beside[name] = _member(path, name)
-    numbers = {name: one for name, one in beside.items() if one.size > 1 and one.dtype.kind in "uif"}
-    lines = {name: Coordinate(one, None) for name, one in numbers.items()}
-    around = {name: one.item() for name, one in beside.items() if one.size == 1}
+    lines, around = lines_and_numbers(beside)
 
     def channel(name: str) -> Channel:
         shape, dtype = maps[name]

@@ -2,6 +2,7 @@
 
 import codecs
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,17 +29,10 @@ _FEWEST_NULS = 0.8
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
-# The words of other programs, in the languages of their users; letters and digits alone are compared.
+# Letters and digits alone of a key are compared.
 _NO_LETTER = re.compile(r"[\W_]+")
-_WIDTHS = ("width", "breite", "largeur", "larghezza", "ancho", "anchura", "šířka", "xlength", "xrange")
-_HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška", "ylength", "yrange")
-_CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channelname")
-_UNITS = ("valueunits", "valueunit", "einheiten", "unités", "unitàvalore", "unidadesdevalor",
-          "jednotkyhodnot", "zunit", "zunits", "dataunit", "dataunits", "heightunit", "heightunits",
-          "unitofheight", "unitsofheight", "unitofheights", "unitsofheights", "unit", "units", "einheit",
-          "единицыизмерения", "値の単位", "값단위")  # fmt: skip
-# What heights are not measured in.
-_NO_LENGTHS = {"V", "mV", "A", "nA", "pA", "N", "nN", "deg", "°", "rad", "Hz", "kHz", "%", "a.u."}
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+_KEYS: dict[str, list[str]] = WORDS["keys"]
 # The unit of a column or of all numbers, as in "Height [nm]"; before a number it is that of a length.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
@@ -46,11 +40,6 @@ _TITLED = re.compile(
     r"(?!\s*[:=\t;,]\s*[-\d])",
     re.IGNORECASE,
 )
-_PIXELS = (
-    ("nrows", "rows", "ypixels", "yres", "ny", "vertical"),
-    ("ncols", "cols", "columns", "xpixels", "xres", "nx", "horizontal"),
-)
-_MISSING = ("nodatavalue", "nodata", "missingvalue", "invalidvalue", "voidpixels")
 _TO_METRES = "height conversion factor (-> m)"
 _SCALES = re.compile(
     r"bit2nm|(scale|conversion|calibration)[ _-]?factor|^(multiplier|scale|factor|lsb)\b|"
@@ -73,15 +62,15 @@ class Block:
     first_line: int
     rows: list[str] = field(default_factory=list)
 
-    def first(self, names: tuple[str, ...]) -> str:
-        """What the header says under the first of these keys, by their letters; empty if nothing."""
+    def first(self, *keys: str) -> str:
+        """What the header says under the first of the words for these keys; empty if nothing."""
         lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
-        return next((lower[name] for name in names if name in lower), "")
+        return next((lower[name] for key in keys for name in _KEYS.get(key, [key]) if name in lower), "")
 
     @property
     def name(self) -> str:
         """Of the channel, if the header gives one."""
-        return self.first(_CHANNELS)
+        return self.first("channel")
 
     @property
     def unit(self) -> str | None:
@@ -90,8 +79,8 @@ class Block:
             return "m"
         titled = [unit for text in self.words for unit in _TITLED.findall(text[:200])]
         lengths = [unit for unit in titled if is_length(unit)]
-        others = [unit for unit in titled if unit in _NO_LENGTHS]
-        return self.first(_UNITS).strip("[]() ") or next(iter(lengths + others), None)
+        others = [unit for unit in titled if unit in WORDS["units"]["no_lengths"]]
+        return self.first("unit").strip("[]() ") or next(iter(lengths + others), None)
 
     def require_pixels(self, shape: Shape) -> None:
         """Compare the numbers of rows and columns with what the header states.
@@ -99,8 +88,8 @@ class Block:
         Raises:
             InputError: it states others.
         """
-        for count, names, what in zip(shape, _PIXELS, ("rows", "columns"), strict=True):
-            stated = self.first(names)
+        for count, what in zip(shape, ("rows", "columns"), strict=True):
+            stated = self.first(what)
             if stated.isdecimal() and int(stated) != count:
                 raise InputError(f"number of {what}", got=count, wanted=f"{stated} as in the header")
 
@@ -124,14 +113,14 @@ class Block:
     @property
     def missing(self) -> list[float]:
         """The numbers that the header says mark missing pixels."""
-        stated = self.first(_MISSING)
+        stated = self.first("missing")
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
         """From the two sides, or from the size of a pixel."""
-        if pitch := _length_um(self.first(("pixelsize", "xycalibration"))):
+        if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
-        sides = [_length_um(self.first(names)) for names in (_HEIGHTS, _WIDTHS)]
+        sides = [_length_um(self.first(side)) for side in ("height", "width")]
         return (sides[0], sides[1]) if sides[0] and sides[1] else None
 
 

@@ -4,16 +4,8 @@ from litho_data.roughness.amplitude import (
     AmplitudeParameters,
     amplitude_parameters,
     autocorrelation,
-    correlation_length_um,
     effective_samples,
     sq_uncertainty_nm,
-)
-from litho_data.roughness.areal import (
-    ArealParameters,
-    areal_parameters,
-    decay_lengths_um,
-    high_pass,
-    low_pass,
 )
 from litho_data.roughness.grating import Scale, Wave, axis_scales, find_wave, line_bow
 from litho_data.roughness.levelling_bias import (
@@ -23,13 +15,12 @@ from litho_data.roughness.levelling_bias import (
     retained_variance_by_rows,
 )
 from litho_data.roughness.noise import white_noise
-from litho_data.roughness.spectrum import Spectrum, psd_along, psd_radial
+from litho_data.roughness.spectrum import Spectrum, psd_along
 from litho_data.roughness.step_height import StepHeight, find_step, groove_depth, stair_steps
 from litho_data.roughness.texture import LineDirection, LinePeriod, line_direction, line_period
 
 __all__ = [
     "AmplitudeParameters",
-    "ArealParameters",
     "LineDirection",
     "LinePeriod",
     "Scale",
@@ -37,24 +28,18 @@ __all__ = [
     "StepHeight",
     "Wave",
     "amplitude_parameters",
-    "areal_parameters",
     "autocorrelation",
     "axis_scales",
-    "correlation_length_um",
-    "decay_lengths_um",
     "effective_samples",
     "exponential_correlation",
     "find_step",
     "find_wave",
     "gaussian_correlation",
     "groove_depth",
-    "high_pass",
     "line_bow",
     "line_direction",
     "line_period",
-    "low_pass",
     "psd_along",
-    "psd_radial",
     "retained_variance",
     "retained_variance_by_rows",
     "sq_uncertainty_nm",

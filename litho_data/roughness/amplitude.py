@@ -6,7 +6,6 @@ import scipy.fft
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
-from litho_data.scan import Axis
 
 
 class AmplitudeParameters(Record):
@@ -81,26 +80,6 @@ def autocorrelation(height_um: Array) -> Array:
     if covariance[0, nx // 2 - 1] <= 0:
         raise InputError("surface", got="a flat one", wanted="heights that vary")
     return covariance / covariance[0, nx // 2 - 1]
-
-
-def correlation_length_um(height_um: Array, pitch_um: float, axis: Axis) -> float:
-    """Lag at which the autocorrelation along an axis first falls to 1/e, µm, linear between pixels.
-
-    Infinity if it stays above that over half the field.
-    """
-    correlation = autocorrelation(height_um)
-    centre = correlation.shape[1] // 2
-    profile = correlation[0, centre:] if axis == "x" else correlation[:, centre]
-    return pitch_um * first_fall(profile, np.exp(-1))
-
-
-def first_fall(values: Array, level: float) -> float:
-    """Index at which values first fall to a level, linear between them; infinity if they never do."""
-    below = np.flatnonzero(values <= level)
-    if below.size == 0:
-        return float("inf")
-    before, after = values[below[0] - 1 : below[0] + 1]
-    return float(below[0] - (level - after) / (before - after))
 
 
 def effective_samples(height_um: Array) -> float:

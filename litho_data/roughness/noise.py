@@ -38,14 +38,19 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
 
 
 def _fine(values: Array, axis: int) -> Array:
-    """Differences of order ``_FINE_ORDER`` along an axis; white noise keeps its variance."""
-    return np.diff(values, _FINE_ORDER, axis=axis) / comb(2 * _FINE_ORDER, _FINE_ORDER) ** 0.5
+    return fine_differences(values, _FINE_ORDER, axis)
+
+
+def fine_differences(values: Array, order: int, axis: int) -> Array:
+    """Differences of an order along an axis; white noise keeps its variance, a polynomial below it is 0."""
+    return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 
 
 def _fine_sd(differences: Array) -> float:
-    known = differences[np.isfinite(differences)]
-    return _robust_sd(known) if known.size > _FINE_ORDER else float("nan")
+    return robust_sd(differences) if np.isfinite(differences).sum() > _FINE_ORDER else float("nan")
 
 
-def _robust_sd(values: Array) -> float:
-    return float(_MAD_TO_SD * np.median(np.abs(values - np.median(values))))
+def robust_sd(values: Array) -> float:
+    """Standard deviation by the median of the distances from the median, NaN left out; NaN of none."""
+    known = values[np.isfinite(values)]
+    return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

@@ -16,8 +16,7 @@ class Spectrum:
 
     Args:
         frequency_per_um: cycles/µm, ascending.
-        density: nm²·µm for a spectrum along one axis (its integral over frequency is Sq², one-sided),
-            nm²·µm² for a radial mean of the two-dimensional density (``∫ 2πf·density df`` is Sq²).
+        density: nm²·µm; its integral over frequency is Sq², one-sided.
     """
 
     frequency_per_um: Array
@@ -39,41 +38,13 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
     Raises:
         InputError: NaN in the surface, lines shorter than 8 pixels, or another axis.
     """
+    from scipy.signal import periodogram
+
     lines = _lines(height_um, axis)
     size = lines.shape[1]
-    weight = np.hanning(size + 2)[1:-1] if window else np.ones(size)
-    if window:
-        lines = lines - _straight_line(lines)
-    power = np.abs(np.fft.rfft(lines * weight, axis=1)) ** 2
-    density = power.mean(axis=0) * pitch_um / np.sum(weight**2)
-    # Frequencies other than 0 and Nyquist stand for their negative counterparts as well.
-    density[1 : None if size % 2 else -1] *= 2
-    return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
-
-
-def psd_radial(height_um: Array, pitch_um: float, *, window: bool = True) -> Spectrum:
-    """Radial mean of the two-dimensional power spectral density, square pixels.
-
-    Args:
-        height_um: finite heights, µm, shape (ny, nx).
-        pitch_um: pitch of both axes, µm.
-        window: False for periodic surfaces.
-
-    Raises:
-        InputError: NaN in the surface, or fewer than 8 pixels along an axis.
-    """
-    from scipy.ndimage import mean
-
-    _lines(height_um, "x"), _lines(height_um, "y")
-    height_nm = 1e3 * height_um.astype(float)
-    ny, nx = height_nm.shape
-    weight = hann(height_nm.shape) if window else np.ones((ny, nx))
-    height_nm = height_nm - (height_nm * weight).sum() / weight.sum()
-    density = np.abs(np.fft.fft2(height_nm * weight)) ** 2 * pitch_um**2 / np.sum(weight**2)
-    frequency = np.hypot(np.fft.fftfreq(ny, pitch_um)[:, None], np.fft.fftfreq(nx, pitch_um)[None, :])
-    width = 1 / (min(ny, nx) * pitch_um)
-    rings = np.arange(1, min(ny, nx) // 2 + 1)
-    return Spectrum(rings * width, mean(density, np.rint(frequency / width).astype(int), rings))
+    shape, trend = (np.hanning(size + 2)[1:-1], "linear") if window else (np.ones(size), "constant")
+    frequency, density = periodogram(lines, 1 / pitch_um, shape, detrend=trend)
+    return Spectrum(frequency[1:], density.mean(axis=0)[1:])
 
 
 def hann(shape: Shape) -> Array:
@@ -100,9 +71,4 @@ def _lines(height_um: Array, axis: Axis) -> Array:
         )
     if lines.shape[1] < 8:
         raise InputError("lines of a spectrum", got=f"{lines.shape[1]} px", wanted="at least 8 px")
-    return lines - lines.mean(axis=1, keepdims=True)
-
-
-def _straight_line(lines: Array) -> Array:
-    position = np.arange(lines.shape[1]) - (lines.shape[1] - 1) / 2
-    return np.outer(lines @ position / (position @ position), position)
+    return lines

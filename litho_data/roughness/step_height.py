@@ -31,9 +31,7 @@ class StepHeight(Record):
     lines: int
 
 
-def groove_depth(
-    height_um: Array, pitch_um: float, *, left_um: float, right_um: float, axis: Axis = "x"
-) -> StepHeight:
+def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um: float) -> StepHeight:
     """Height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
 
     On every line ``z = a·x + b + h·δ`` is fitted with δ = 1 on the middle third of the feature and
@@ -44,13 +42,12 @@ def groove_depth(
         height_um: heights, µm, shape (ny, nx); NaN is left out.
         left_um: first edge along the axis, µm from the field's border.
         right_um: second edge, µm.
-        axis: direction of the profiles.
 
     Raises:
         InputError: edges in the wrong order, or arms outside the field.
     """
     width_um = right_um - left_um
-    lines, position_um = _profiles(height_um, pitch_um, axis)
+    lines, position_um = _profiles(height_um, pitch_um, "x")
     extent_um = lines.shape[1] * pitch_um
     if width_um <= 0 or left_um - width_um < -1e-9 or right_um + width_um > extent_um + 1e-9:
         raise InputError(

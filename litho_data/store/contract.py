@@ -34,6 +34,7 @@ from litho_data.store.schema import (
     SIGMA,
     TEXT_COLUMNS,
     WRITE,
+    Instrument,
     Surround,
 )
 from litho_data.store.write import pixel_centres_um
@@ -145,6 +146,8 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
             wanted = f"a {'whole ' if whole else ''}number from {limits}"
             raise InputError(f"attribute {key} of {path}", got=repr(value), wanted=wanted)
         checked[key] = value if whole else float(value)
+    checked["instrument"] = attributes.get("instrument", "afm")
+    require_known(f"instrument of {path}", checked["instrument"], get_args(Instrument))
     if "field_um" in write:
         LENGTH_UM.require(f"write_field_um of {path}", write["field_um"])
     return checked

@@ -34,7 +34,8 @@ class PrintedScan:
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
             NaN where not valid, None if the store has none.
         groups: what the card's pattern of ids says beside the print, such as the field; by name.
-        instrument: that scanned it, if the card's table names it.
+        instrument: that scanned it, if the card's table names it; ``seen_by``: what kind it is, which says
+            what the heights are (``Instrument``).
         surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 shows),
             ``continues`` (more of the print, so that the outermost pixels are not valid) or ``unknown``,
             also if the card does not say.
@@ -63,6 +64,7 @@ class PrintedScan:
     height_sigma_um: Array | None = None
     groups: Mapping[str, str] = field(default_factory=dict)
     instrument: str = ""
+    seen_by: str = "afm"
     surround: str = "unknown"
 
     def __repr__(self) -> str:
@@ -73,7 +75,7 @@ class PrintedScan:
         )
 
     def _repr_html_(self) -> str:
-        from litho_data.foundation.report_pictures import shown_html
+        from litho_data.reports.pictures import shown_html
 
         return shown_html(repr(self), layout_um=self.layout_um, height_um=self.height_um)
 

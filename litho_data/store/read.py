@@ -33,7 +33,7 @@ from litho_data.store.contract import (
     require_possible,
     true_shapes,
 )
-from litho_data.store.lock_box import lock_box, lock_box_size
+from litho_data.store.lock_box import lock_box
 from litho_data.store.printed_scan import PrintedScan as PrintedScan
 from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
@@ -42,6 +42,7 @@ from litho_data.store.schema import (
     TEXT_COLUMNS,
     VARIABLES,
     DatasetId,
+    Instrument,
     dataset_sha256,
 )
 
@@ -80,6 +81,7 @@ class Store:
         self.level_height_um: float = attributes["level_height_um"]
         self.levels: int = attributes["levels"]
         self.write: dict[str, Any] | None = attributes["write"]
+        self.instrument: Instrument = attributes["instrument"]
         self._arrays = checked_arrays(root, path)
         require_own_pixels(root, path, self._arrays["mask_level"].shape[1:], self.pitch_um)
         self._columns = checked_columns(root, path)
@@ -121,6 +123,7 @@ class Store:
             levels=self.levels,
             scan_to_layout=self.sample("scan_to_layout", row),
             write=self.write,
+            seen_by=self.instrument,
             **{name: self._column(name, row) for name in OPTIONAL_COLUMNS},
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
@@ -174,7 +177,7 @@ class Store:
     @property
     def locked_ids(self) -> list[str]:
         """Ids of the lock box: a sixth of the scans, from different prints, the same in every session."""
-        return lock_box(self.ids, self._print_ids, lock_box_size(len(self)))
+        return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
         """Hash of the raw file of each of these scans, however they were levelled and registered.
@@ -234,7 +237,11 @@ class Store:
 
     def computed_sha256(self) -> str:
         """Hash of the dataset from the arrays as they are now."""
-        facts = {name: getattr(self, name) for name in ("pitch_um", "level_height_um", "levels")}
+        facts: dict[str, Any] = {
+            name: getattr(self, name) for name in ("pitch_um", "level_height_um", "levels")
+        }
+        if self.instrument != "afm":
+            facts["instrument"] = self.instrument
         if self.write:
             facts["write"] = self.write
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])

@@ -56,6 +56,9 @@ SIGMA = Variable("height_sigma_um", ("scan", "y", "x"), "float32", "um",
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layouts' grid."""
 SCAN_VARIABLES = (
+    Variable("micrograph", ("y", "x"), "uint16", "1", "grey values as read from the raw file, scan frame"),
+    Variable("edge_distance_um", ("y", "x"), "float32", "um",
+             "signed distance from the nearest edge of the film, positive on it, capped; scan frame"),
     Variable("raw_height_um", ("y", "x"), "float32", "um", "height as read from the raw file, scan frame"),
     Variable("levelled_height_um", ("y", "x"), "float32", "um", "height after levelling, scan frame"),
     Variable("removed_um", ("y", "x"), "float32", "um", "surface that levelling removed, scan frame"),
@@ -86,6 +89,9 @@ OPTIONAL_COLUMNS = {
     "pixel_size": Range(1e-3, 1e3),
 }
 """Numbers per scan from the card's table, and what they may be; coordinates, NaN where a row has none."""
+Instrument = Literal["afm", "sem"]
+"""What heights are: measured by an atomic force microscope, or a film's height times its coverage of a
+pixel, from the edges in an electron micrograph."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
@@ -95,7 +101,8 @@ def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]])
     """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
 
     Args:
-        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, if known, the ``write`` table.
+        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, if known, the ``write`` table; the
+            ``instrument`` if it is no AFM.
         scans: per scan in stored order: ``id``, ``print``, ``order``, the optional columns that are not NaN,
             and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
     """

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
 """What fills the place beyond a layout that is smaller than the largest."""
 # What an image of a scan shows.
-_SHOWN = ("levelled_height_um", "raw_height_um")
+SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 # Attributes of the CF conventions beyond unit and name.
 _CF: dict[str, dict[str, Any]] = {
@@ -48,7 +48,7 @@ def write_scan_group(
         use: as in the card's table.
         pitch_um: (y, x) of the scan.
     """
-    shown = next(name for name in _SHOWN if name in arrays)
+    shown = next(name for name in SHOWN if name in arrays)
     attributes = {"use": use, "ome": _ome(scan_id, shown, pitch_um)}
     group = root.create_group(f"scans/{scan_id}", overwrite=True, attributes=attributes)
     for variable in SCAN_VARIABLES:

@@ -6,9 +6,8 @@ from functools import lru_cache
 import numpy as np
 
 from litho_data.foundation.kinds import YX, Array
+from litho_data.roughness.noise import fine_differences, robust_sd
 
-_MAD_PER_SIGMA = 0.6744897501960817
-_FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)
 # Pixels: each size adds some to the disc before it.
 DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 # Noise of a curvature that is quiet enough, as a share of the curvature of the tip.
@@ -29,7 +28,7 @@ def noise_of(height_um: Array) -> Noise:
 
     What varies more down the columns than along the rows is an offset of whole rows, and the other way round.
     """
-    rows, columns = (_fourth_difference(height_um, axis) for axis in (0, 1))
+    rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
     return Noise(pixel, float(np.sqrt(other**2 - pixel**2)), rows > columns)
 
@@ -88,12 +87,3 @@ def disc(radius_px: float) -> Array:
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9
-
-
-def _fourth_difference(height_um: Array, axis: int) -> float:
-    lines = np.moveaxis(height_um, axis, -1)
-    difference = np.diff(lines, len(_FOURTH) - 1)
-    values = np.abs(difference[np.isfinite(difference)])
-    if values.size == 0:
-        return 0.0
-    return float(np.median(values) / _MAD_PER_SIGMA / np.sqrt(sum(weight**2 for weight in _FOURTH)))

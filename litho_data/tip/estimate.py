@@ -11,15 +11,11 @@ from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.scan import Scan
-from litho_data.tip.blind import blind_tip, full_angle_bound_deg
 from litho_data.tip.certainty import tip_certain
 from litho_data.tip.curvature import noise_of
 from litho_data.tip.radius import of_one_tip, peak_radius
 from litho_data.tip.resolution import lateral_resolution_um
 
-_THRESHOLD_SIGMA = 6.0
-_LEAST_THRESHOLD = 1e-3
-_SMALLEST_HALF_PX, _LARGEST_HALF_PX = 3, 12
 _SAME_PITCH = 1e-3
 
 
@@ -42,7 +38,6 @@ class TipEstimate(RunFacts, Result):
         radius_um: radius of the end of the tip, or the most that it can be; None if the scans set no bound.
         radius_sd_um: standard uncertainty of an estimate; None for a bound.
         reason: why it is no more than a bound; empty for an estimate.
-        full_angle_deg: most that the angle between opposite flanks can be.
         depth_um: range of heights, without tilt and bow, of the scan behind the radius.
         reach_px: √(2 R depth) in pixels: how far the image of a spike reaches.
         pixel_noise_nm, line_noise_nm: noise of the scans, root of the mean square.
@@ -59,7 +54,6 @@ class TipEstimate(RunFacts, Result):
     radius_um: float | None
     radius_sd_um: float | None
     reason: str
-    full_angle_deg: float
     depth_um: float
     reach_px: float | None
     pixel_noise_nm: float
@@ -75,7 +69,7 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
 
     The radius comes from the sharpest tops: an image is nowhere more sharply curved than the end of its tip.
     It is an estimate only where many tops have the same, largest curvature and the valleys have more;
-    otherwise the tip may be sharper than anything it met. The flanks are bounded by blind tip estimation.
+    otherwise the tip may be sharper than anything it met.
 
     Args:
         scans: with a pitch, all the same. Levelling is of little influence.
@@ -87,23 +81,15 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     heights = [scan.height_um for scan in scans]
     found = of_one_tip([peak_radius(height, pitch_um) for height in heights])
     noises = [noise_of(height) for height in heights]
-    threshold_um = max(
-        _THRESHOLD_SIGMA * max(math.hypot(one.pixel_um, one.line_um) for one in noises),
-        max(pitch_um) ** 2 / (2 * found.radius_um) if found.radius_um else 0.0,
-        _LEAST_THRESHOLD * found.depth_um,
-    )
     reach_px = None
     if found.radius_um is not None:
         reach_px = math.sqrt(2 * found.radius_um * found.depth_um) / max(pitch_um)
-    half_px = int(np.clip(math.ceil(reach_px or 0) + 1, _SMALLEST_HALF_PX, _LARGEST_HALF_PX))
-    blind = blind_tip(heights, half_px, threshold_um)
     return TipEstimate(
         **run_facts(),
         kind="upper bound" if found.reason else "estimate",
         radius_um=found.radius_um,
         radius_sd_um=None if found.reason else found.sd_um,
         reason=found.reason,
-        full_angle_deg=full_angle_bound_deg(blind, pitch_um),
         depth_um=found.depth_um,
         reach_px=reach_px,
         pixel_noise_nm=1e3 * _rms([one.pixel_um for one in noises]),

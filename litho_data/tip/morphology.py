@@ -1,8 +1,6 @@
-"""Grey-scale morphology of a scan: the image is the surface dilated by the tip.
+"""The surface under an image: a tip dilates what it scans, and eroding the image by the tip gives it back.
 
-A tip is an array of heights (2k + 1, 2k + 1) with 0 at its end and ≤ 0 elsewhere. ``dilate`` takes the
-highest surface pixel plus tip, ``erode`` the lowest image pixel minus tip; dilating what was eroded gives the
-*opening*, eroding what was dilated the *closing*. A pixel that was not measured (NaN) takes no part.
+A pixel that was not measured (NaN) takes no part.
 """
 
 from typing import NamedTuple
@@ -18,21 +16,6 @@ class Eroded(NamedTuple):
     surface: Array
     row: Array
     column: Array
-
-
-def dilate(surface: Array, tip: Array) -> Array:
-    """``max over u of surface(x − u) + tip(u)``, same shape; −inf where nothing was measured in reach."""
-    return -_erode(-surface, tip[::-1, ::-1])
-
-
-def erode(image: Array, tip: Array) -> Array:
-    """``min over u of image(x + u) − tip(u)``, same shape; +inf where nothing was measured in reach."""
-    return _erode(image, tip)
-
-
-def paraboloid_dilation(surface: Array, pitch_um: YX, radius_um: float) -> Array:
-    """The image of a surface (ny, nx), µm, under a paraboloid tip −u²/2R; NaN stays NaN."""
-    return -paraboloid_erosion(-surface, pitch_um, radius_um).surface
 
 
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
@@ -67,10 +50,3 @@ def _erode_rows(
             np.copyto(lowest[:, to], candidate, where=better)
             np.copyto(owner[:, to], places[:, start], where=better)
     return lowest, owner
-
-
-def _erode(image: Array, tip: Array) -> Array:
-    from scipy.ndimage import grey_erosion
-
-    heights = np.where(np.isfinite(image), image, np.asarray(np.inf, image.dtype))
-    return grey_erosion(heights, footprint=np.isfinite(tip), structure=tip, mode="constant", cval=np.inf)

@@ -159,7 +159,10 @@ class _Tops:
 
 
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
-    weights = _parabola(half_px) / pitch_um**2
+    from scipy.signal import savgol_coeffs
+
+    # Of the second derivative of the best parabola through a window.
+    weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
     return _Tops(half_px, noise, curvature, _edge(curvature, noise))
@@ -178,12 +181,6 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
         bent[~minimum_filter(measured, size)] = np.nan
     return bent[half:-half, half:-half]
-
-
-def _parabola(half_px: int) -> Array:
-    """Weights of the second derivative of the best parabola through 2 half_px + 1 pixels, 1/px²."""
-    x = np.arange(-half_px, half_px + 1.0)
-    return np.linalg.pinv(np.stack([np.ones_like(x), x, x**2 / 2], axis=1))[2]
 
 
 def _edge(curvatures: Array, noise: float) -> float:

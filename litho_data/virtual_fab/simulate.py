@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from litho_data.cards.card import load_card
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.foundation.kinds import Shape
@@ -218,9 +218,7 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
     )
 
 
-def simulate_plan(
-    plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1, cause: Cause | None = None
-) -> Path:
+def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
     """Print and scan a plan in the fab of an earlier run; returns the path of the new card.
 
     The machine is the same: printer, microscope, noise and knobs with their seeds. The run is a new one: what
@@ -231,7 +229,6 @@ def simulate_plan(
         fab: folder of the earlier run, with its ``truth``.
         out: where ``raw`` and ``truth`` of the new run go.
         seed: of the new draws; another than the earlier run's.
-        cause: what that run had beside its knobs.
 
     Raises:
         InputError: no plan, no truth, the seed of the earlier run, or layouts that its printer cannot write.
@@ -246,7 +243,6 @@ def simulate_plan(
         jobs=jobs_of_card(card, first=len(truth.scans), printer=truth.printer),
         seed=seed,
         knobs=[knob.setting for knob in truth.knobs],
-        cause=cause,
         noise=truth.noise,
         microscope=truth.microscope,
         printer=truth.printer,

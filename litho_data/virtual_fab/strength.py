@@ -2,19 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
-
-Policy = Literal["none", "offset", "full"]
 
 # Noise by nature: no noise-free scan shows it, its strength is its rms.
 NOISE_KNOB = "line-roughness"
@@ -35,9 +32,7 @@ def strength_for_rms(
     rms_nm: float,
     *,
     jobs: Sequence[Job] | None = None,
-    policy: Policy = "full",
     seed: int = 0,
-    printer: Printer | None = None,
 ) -> KnobStrength:
     """The strength at which a knob changes the noise-free scans by ``rms_nm``.
 
@@ -48,19 +43,18 @@ def strength_for_rms(
         name: knob.
         rms_nm: wanted rms, nm.
         jobs: fields to measure it on; by default four of 256 × 256 px, two of each cut-off.
-        policy: what is removed from each scan before the rms is taken.
         seed: seed of the knob.
 
     Raises:
-        InputError: an unknown knob or policy, an rms that is not positive, or a knob that leaves no
-            trace under the policy.
+        InputError: an unknown knob, an rms that is not positive, or a knob of which the terms of single scans
+            leave no trace.
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
-    fields = tuple(jobs) if jobs is not None else default_fields(printer or Printer(), seed)
+    fields = tuple(jobs) if jobs is not None else default_fields(Printer(), seed)
 
     def measured(strength: float) -> float:
-        return knob_rms_nm(KnobSetting(name, strength, seed), fields, policy=policy, printer=printer)
+        return knob_rms_nm(KnobSetting(name, strength, seed), fields)
 
     checked(KnobSetting(name, 0.0))
     highest = KNOBS[name].limit
@@ -71,7 +65,7 @@ def strength_for_rms(
     # Remainders of float32 size are no trace of the effect.
     if at_limit < 1e-3:
         raise InputError(
-            f"knob {name}", got=f"no trace under policy {policy}", wanted="another knob or policy"
+            f"knob {name}", got="no trace beside offset, gain, plane and bow", wanted="another knob"
         )
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)
@@ -106,37 +100,27 @@ def search_strength(
     return strength, found
 
 
-def knob_rms_nm(
-    setting: KnobSetting, jobs: Sequence[Job], *, policy: Policy = "full", printer: Printer | None = None
-) -> float:
+def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
     """Rms over the scans of (noise-free scan with the knob) − (without), without nuisances, nm.
 
-    Scans are aligned with the layout, so a warp counts by the heights it changes. Policy ``full``
-    removes the least-squares fit of {1, P, x, y, x², xy, y²} from each scan, P the scan without the
-    knob; ``offset`` the mean; ``none`` nothing.
+    Scans are aligned with the layout, so a warp counts by the heights it changes. The least-squares
+    fit of {1, P, x, y, x², xy, y²} is removed from each scan, P the scan without the knob.
     """
-    require_known("policy", policy, get_args(Policy))
     mean_squares = []
     for job in jobs:
         without = _noise_free(job, (), printer)
         change = _noise_free(job, (setting,), printer) - without
-        mean_squares.append(np.mean(free_of_nuisances(change, without, policy) ** 2))
+        mean_squares.append(np.mean(_free_of_nuisances(change, without) ** 2))
     return float(1e3 * np.sqrt(np.mean(mean_squares)))
 
 
-def free_of_nuisances(change: Array, prediction: Array, policy: Policy) -> Array:
-    """``change`` minus its least-squares fit by the terms of the policy, same shape."""
-    if policy == "none":
-        return change
-    ones = np.ones(change.size)
-    terms = [ones]
-    if policy == "full":
-        y, x = (
-            axis.ravel()
-            for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
-        )
-        terms = [ones, prediction.ravel() - prediction.mean(), y, x, y * y, x * y, x * x]
-    basis = np.stack(terms, axis=1)
+def _free_of_nuisances(change: Array, prediction: Array) -> Array:
+    """``change`` minus its least-squares fit by the prediction and a quadratic surface, same shape."""
+    y, x = (
+        axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
+    )
+    own = prediction.ravel() - prediction.mean()
+    basis = np.stack([np.ones(change.size), own, y, x, y * y, x * y, x * x], axis=1)
     weights, *_ = np.linalg.lstsq(basis, change.ravel(), rcond=None)
     return change - (basis @ weights).reshape(change.shape)
 

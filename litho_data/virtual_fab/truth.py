@@ -8,6 +8,7 @@ import numpy as np
 
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record, Result
+from litho_data.level import level_polynomial
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
@@ -81,7 +82,7 @@ class Truth(Result):
 def noise_floor(noise_um: Array) -> dict[str, float]:
     """Size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow, nm."""
     centred_nm = 1e3 * (noise_um - noise_um.mean())
-    bent_nm = centred_nm - quadratic_surface(centred_nm)
+    bent_nm = level_polynomial(centred_nm, total_degree=2).height
     return {
         "datum_nm": float(1e3 * noise_um.mean()),
         "floor_mae_nm": float(np.abs(centred_nm - np.median(centred_nm)).mean()),
@@ -89,14 +90,3 @@ def noise_floor(noise_um: Array) -> dict[str, float]:
         "floor_full_mae_nm": float(np.abs(bent_nm).mean()),
         "floor_full_rmse_nm": float(bent_nm.std()),
     }
-
-
-def quadratic_surface(field: Array) -> Array:
-    """Least-squares surface of {1, x, y, x², xy, y²}, same shape as ``field``."""
-    # Legendre products are nearly orthogonal on the grid, which keeps the normal equations well conditioned.
-    y, x = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 2) for size in field.shape)
-    pairs = [(0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
-    gram = np.array([[(y[:, a] @ y[:, c]) * (x[:, b] @ x[:, d]) for c, d in pairs] for a, b in pairs])
-    moments = np.array([y[:, a] @ field @ x[:, b] for a, b in pairs])
-    weights = np.linalg.solve(gram, moments)
-    return sum(weight * np.outer(y[:, a], x[:, b]) for weight, (a, b) in zip(weights, pairs, strict=True))

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from litho_data.foundation.app import new_app, run_app, with_further_options
+from litho_data.commands.app import new_app, run_app, with_further_options
+from litho_data.commands.settings import changed
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import changed
-from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
+from litho_design.cli.design import compare, correct, first, hoe, lens, settings
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -34,7 +34,6 @@ app.command()(hoe)
 app.command()(lens)
 app.command()(correct)
 app.command()(compare)
-app.command()(estimate)
 app.command()(settings)
 
 
@@ -45,7 +44,10 @@ def score(
     out: Out,
     judge: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable"),
+        typer.Option(
+            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable. Without it, "
+            "scan and photograph: the models of the zoo for the same printer"
+        ),
     ] = None,
     scan: Scan = None,
     scan_unit: ScanUnit = None,
@@ -119,9 +121,7 @@ def score(
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option(
-            "--stream", help="hologram of any size: printed and scored band by band, the rest on disk"
-        ),
+        typer.Option("--stream", help="large hologram: printed and scored band by band"),
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",
@@ -136,8 +136,6 @@ def score(
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
-    if not judge and scan is None and camera is None:
-        raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
     stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
     if camera is not None and camera_pitch_um is None:
         raise InputError(
@@ -164,7 +162,7 @@ def score(
     result = score_design(
         design,
         out,
-        judges=judge or (),
+        judges=judge,
         scan=measured,
         camera=photo,
         element=element,

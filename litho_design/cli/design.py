@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from litho_data.foundation.app import DaskOption, WorkersOption
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import changed
+from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.commands.settings import changed
 from litho_design.cli.options import (
     BandPx,
     Device,
@@ -26,7 +25,6 @@ from litho_design.cli.options import (
     ScanUnit,
     as_toml,
     measured_source,
-    numbers,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
@@ -35,7 +33,6 @@ from litho_design.optimisation.settings import DesignSettings
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 
 if TYPE_CHECKING:
-    from litho_design.judging.front import FrontResult
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
@@ -54,16 +51,6 @@ SpreadOf = Annotated[
         "scans left out",
         hidden=True,
     ),
-]
-RoughnessOf = Annotated[
-    Path | None,
-    typer.Option(
-        help="noise.json of litho-models noise: the surface of a print is as rough as measured", hidden=True
-    ),
-]
-Ensemble = Annotated[
-    list[str] | None,
-    typer.Option(help="NAME=MODEL of a further model in the loss; repeatable", hidden=True),
 ]
 Judges = Annotated[
     list[str] | None,
@@ -118,20 +105,9 @@ def hoe(
     out: Out,
     given: Given,
     target: Target = "text",
-    front: Annotated[
-        str | None,
-        typer.Option(
-            help="efficiency weights, comma-separated, such as 0,0.03,0.1,0.3,1: one design each, and the "
-            "front of efficiency against likeness"
-        ),
-    ] = None,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
-    workers: WorkersOption = 1,
-    dask: DaskOption = None,
     large: Annotated[
         bool,
         typer.Option(
@@ -149,30 +125,16 @@ def hoe(
 
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
-    settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
-    if front is None and (dask or workers > 1):
-        raise InputError("--workers and --dask", got="one design", wanted="several: --front")
-    fit: Any = {"device": device, "extrapolate": extrapolate}
-    if front is not None:
-        if large:
-            raise InputError("--large", got="--front", wanted="one design")
-        from litho_design.workflows.front import efficiency_front
+    settings = _settings(given, _hologram, "hoe", spread_of)
+    from litho_design.large.bands import Ranks
+    from litho_design.workflows.design import design_hologram
 
-        result = efficiency_front(
-            target, model, out, weights=numbers("--front", front, float), settings=settings,
-            ensemble=ensemble or (), workers=workers, dask=dask, **fit,
-        )  # fmt: skip
-        _print_front(result, out)
-    else:
-        from litho_design.large.bands import Ranks
-        from litho_design.workflows.design import design_hologram
-
-        design = design_hologram(
-            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust,
-            band_px=band_px if large else None, **fit,
-        )  # fmt: skip
-        if not large or Ranks.joined().rank == 0:
-            _print_design(design, out)
+    design = design_hologram(
+        target, model, out, settings=settings, judges=judge, robust=robust,
+        band_px=band_px if large else None, device=device, extrapolate=extrapolate,
+    )  # fmt: skip
+    if not large or Ranks.joined().rank == 0:
+        _print_design(design, out)
 
 
 @takes_settings(ReliefSettings())
@@ -194,8 +156,6 @@ def correct(
     scan_levelling: ScanLevelling = "bow",
     scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = True,
     device: Device = "cpu",
@@ -206,13 +166,13 @@ def correct(
     Example: litho-design correct blaze --model zoo:pbl --out blaze
     Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
     """
-    settings = _settings(given, relief_settings, "correct", spread_of, roughness_of)
+    settings = _settings(given, relief_settings, "correct", spread_of)
     from litho_design.workflows.design import correct as correct_relief
 
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
-        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
+        judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -225,8 +185,6 @@ def lens(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
-    ensemble: Ensemble = None,
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
@@ -240,12 +198,12 @@ def lens(
 
     Example: litho-design lens --model zoo:pbl --distance-um 200 --out lens
     """
-    settings = _settings(given, _lens, "lens", spread_of, roughness_of)
+    settings = _settings(given, _lens, "lens", spread_of)
     from litho_design.workflows.design import design_lens
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), judges=judge, robust=robust, tile_px=band_px if large else None,
+        judges=judge, robust=robust, tile_px=band_px if large else None,
         device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
@@ -269,7 +227,6 @@ def compare(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    roughness_of: RoughnessOf = None,
     seeds: Annotated[int, typer.Option(help="number of seeds: 0, 1, 2 …")] = 3,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
@@ -282,10 +239,10 @@ def compare(
     """
     settings: Any
     if task == "hoe":
-        settings = _settings(given, _hologram, task, spread_of, roughness_of)
+        settings = _settings(given, _hologram, task, spread_of)
     else:
         kind = {"task": task.removeprefix("lens-")}
-        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of, roughness_of)
+        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
     from litho_design.judging.gap import headline
     from litho_design.workflows.compare import compare as run_comparison
 
@@ -298,30 +255,6 @@ def compare(
         if item.figure == headline(result.task)[0]:
             print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
     print(out / "report.html")
-
-
-@takes_settings(HologramSettings())
-def estimate(
-    model: Model,
-    given: Given,
-    ranks: Annotated[int, typer.Option(help="processes that would share the element", min=1)] = 1,
-    measure_px: Annotated[
-        str, typer.Option(help="sides of the elements to be measured, px; the largest counts")
-    ] = "1024,2048",
-    band_px: BandPx = 512,
-    device: Device = "cpu",
-    extrapolate: Extrapolate = False,
-) -> None:
-    """Measure small holograms here, and print what `hoe --large` with these settings would take.
-
-    Example: litho-design estimate --model zoo:physics --size-px 10000
-    """
-    from litho_design.large.cost import estimate_large
-
-    made = _settings(given, _hologram, "estimate")
-    sizes = numbers("--measure-px", measure_px, int)
-    for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
-        print(line)
 
 
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
@@ -343,36 +276,16 @@ def _settings(
     make: Callable[[Mapping[str, Any]], S],
     task: str,
     spread_of: Path | None = None,
-    roughness_of: Path | None = None,
 ) -> S:
     """The preset, then the settings file, the measured spreads and the command line, each over the last."""
     made = make(given.over(make({}), task))
-    window = made.window
-    if spread_of is not None:
-        from litho_data.store import open_store
-        from litho_design.optimisation.process_window import measured_window
+    if spread_of is None:
+        return made
+    from litho_data.store import open_store
+    from litho_design.optimisation.process_window import measured_window
 
-        window = measured_window(open_store(spread_of), window)
-    if roughness_of is not None:
-        from litho_design.optimisation.roughness import measured_roughness
-
-        rough = measured_roughness(roughness_of, made.layout.level_height_um)
-        window = window.model_copy(update={"roughness": rough})
-    measured = made.model_copy(update={"window": window})
-    return measured if window is made.window else changed(measured, given.options)
-
-
-def _print_front(result: FrontResult, out: Path) -> None:
-    from litho_design.reports.advice import baseline_line
-
-    for point in result.points:
-        print(
-            f"efficiency weight {point.efficiency_weight:g}: {100 * point.eff_signal:.1f} % on the signal, "
-            f"{point.si_psnr_db:.2f} dB{'' if point.on_front else ', not on the front'}"
-        )
-    if result.baselines:
-        print(baseline_line(result.baselines))
-    print(out / "report.html")
+    window = measured_window(open_store(spread_of), made.window)
+    return changed(made.model_copy(update={"window": window}), given.options)
 
 
 def _print_design(design: Design, out: Path) -> None:

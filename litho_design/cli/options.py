@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 import typer
 from pydantic import BaseModel
 
-from litho_data.foundation.app import takes, with_further_options
+from litho_data.commands.app import takes, with_further_options
+from litho_data.commands.settings import Leaf, assigned, flattened, leaves, read_settings
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
 if TYPE_CHECKING:
     from litho_design.judging.measured import MeasuredSource

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from litho_data.commands.settings import changed
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import changed
 from litho_design.elements.transforms import printed_anyhow
 from litho_design.optics import Optics
 from litho_design.optics.materials import Resin, refractive_index

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import array_sha256, file_sha256
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.readers.exported import exported_levels, exported_rows
 from litho_design.elements.element import Element
 from litho_design.exports.dxf import write_dxf
@@ -122,12 +121,12 @@ def export(
         if dose_curve is None:
             white_um = (2**bits - 1) / greys[1] * source.layout.level_height_um
     name = f"layout{_SUFFIX[format]}"
-    require_replaceable_folder(out, "layout*")
     place = Path(out)
     _require_same_layout(place, name, source.sha256)
-    with writable(place):
-        place.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
+    with (
+        growing_folder(place, f"{name}.json", holds="layout*"),
+        TemporaryDirectory(prefix=".layout.", suffix=".partial", dir=place) as temporary,
+    ):
         file = Path(temporary) / name
         sidecar: dict[str, Any] = {
             "file": name,

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 from litho_design.exports.rows import LevelRows
 
 # What the piezo of a Photonic Professional reaches along x and y.

@@ -30,11 +30,10 @@ def write_stl(
     """
     if pedestal_um <= 0:
         raise InputError("pedestal_um", got=pedestal_um, wanted="a positive base for a closed solid")
-    points, numbers = step_solid(levels[::-1])
-    underside = points[:, 2] < 0
-    points *= (cell_um, cell_um, level_height_um)
-    points[:, 2] = np.where(underside, 0.0, points[:, 2] + pedestal_um)
-    triangles = points[numbers]
+    triangles = step_solid(levels[::-1])
+    height_um = triangles[..., 2] * level_height_um + pedestal_um
+    triangles[..., 2] = np.where(triangles[..., 2] < 0, 0.0, height_um)
+    triangles[..., :2] *= cell_um
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     records = np.zeros(len(triangles), _RECORD)
     records["normal"] = normal / np.linalg.norm(normal, axis=1, keepdims=True)

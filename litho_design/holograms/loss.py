@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 
 if TYPE_CHECKING:
     from torch import Tensor

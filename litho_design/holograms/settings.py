@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from litho_data.commands.settings import changed, setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import changed, setting
 from litho_design.holograms.loss import HologramLoss
 from litho_design.optics import Optics
 from litho_design.optimisation.settings import (

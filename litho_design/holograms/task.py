@@ -32,7 +32,7 @@ class HologramTask(Task):
         settings: geometry, optics, search and loss (see ``hologram_settings``).
         printer: frozen model, or nominal heights.
         target: wanted image of the size of the element.
-        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+        ensemble: further models in the loss, as for ``Task``.
 
     Raises:
         InputError: a target of another size or without dark and bright pixels, a start for lenses, or

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.report_pictures import shown_html
 from litho_data.foundation.results import Record
+from litho_data.reports.pictures import shown_html
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optics.thin_element import ElementKind

@@ -92,6 +92,8 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
+    # Of the design over doing nothing, where it was compared with that.
+    gain: float | None = None
 
     @classmethod
     def of(cls, folder: Path, record: Design, scores: list[JudgedScore]) -> ScoreResult:
@@ -110,6 +112,7 @@ class ScoreResult(RunFacts, Result):
             designed=record.predicted,
             baselines=record.baselines,
             scores=scores,
+            gain=None if record.width is None else record.width.gain,
         )
 
 

@@ -1,1 +1,1 @@
-"""Elements larger than one process: in bands of rows, shared among processes or kept on disk."""
+"""Elements larger than one process: in bands of rows, shared among processes."""

@@ -7,7 +7,7 @@ same numbers, with one process and with many.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -198,11 +198,3 @@ class Bands:
             got[other].reshape(first.shape) if 0 <= other < count else torch.zeros_like(first)
             for other in sides
         ]
-
-
-Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
-
-
-def in_memory(device: torch.device) -> Allocate:
-    """Room for arrays in the memory of a device."""
-    return lambda shape, dtype: torch.empty(shape, dtype=dtype, device=device)

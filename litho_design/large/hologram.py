@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from litho_data.foundation.results import Record
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target
-from litho_design.large.bands import Bands, in_memory
+from litho_design.large.bands import Bands
+from litho_design.large.figures import image_figures
 from litho_design.large.printing import check_printer, print_bands
 from litho_design.large.propagator import BandedPropagator
-from litho_design.large.score import image_figures, part_of_grid
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
 from litho_design.printers.layout import printability
@@ -152,8 +153,10 @@ class BandedBench(nn.Module):
         super().__init__()
         self.optics, self.pixels = optics, bands.size_px**2
         self.grid = self.window = centred_grid((bands.size_px,) * 2, pitch_um)
-        self.propagator = BandedPropagator(pitch_um, optics, bands, in_memory(device))
-        self.rows = part_of_grid(self.grid, bands.rows())
+        self.propagator = BandedPropagator(pitch_um, optics, bands, device)
+        rows, (top_um, left_um) = bands.rows(), self.grid.origin_um
+        origin_um = (top_um + rows.start * pitch_um, left_um)
+        self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
         """Share of the incident power on the own pixels (rows, size) behind the own heights, µm."""

@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from litho_design.large.bands import Allocate, Bands, in_memory
+from litho_design.large.bands import Bands
 from litho_design.optics import ASMPropagator, Optics, centred_grid
 from litho_design.optics.angular_spectrum import spectrum_axes, transfer_function
 from litho_design.optics.propagators import takes_spectrum
 from litho_design.optics.rayleigh_sommerfeld import rs_kernel
 from litho_design.optics.sampling import check_distance, fast_length
+from litho_design.printers.source import Device
 
 _COLUMNS = 256
 
@@ -33,15 +34,14 @@ class BandedPropagator:
         pitch_um: pixel, µm.
         optics: wavelength, distance, kind of propagation.
         bands: of the element.
-        allocate: room for the large arrays; memory of the processor by default.
 
     Raises:
         InputError: a distance at which the Rayleigh-Sommerfeld kernel is aliased, where that is asked for.
     """
 
-    def __init__(self, pitch_um: float, optics: Optics, bands: Bands, allocate: Allocate | None = None):
+    def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: Device = "cpu"):
         size = bands.size_px
-        self.bands, self.allocate = bands, allocate or in_memory(torch.device("cpu"))
+        self.bands, self.device = bands, device
         self.source = self.target = centred_grid((size, size), pitch_um)
         self.length = fast_length(2 * size - 1)
         width = min(_COLUMNS, bands.band_px)
@@ -52,7 +52,7 @@ class BandedPropagator:
         ] + [self.length]
         first, last = self._starts[bands.ranks.rank : bands.ranks.rank + 2]
         self._blocks = [slice(at - first, min(at + width, last) - first) for at in range(first, last, width)]
-        self._transfer = self.allocate((last - first, self.length // 2 + 1), torch.complex64)
+        self._transfer = self._room(last - first, self.length // 2 + 1)
         spectrum = takes_spectrum(self.source, self.target, optics)
         (self._spectrum_transfer if spectrum else self._kernel_transfer)(optics)
 
@@ -63,25 +63,14 @@ class BandedPropagator:
 
     def adjoint(self, field: Tensor) -> Tensor:
         """P^H of the propagation: it sends a field back."""
-        return self._of_tensor(field, conjugate=True)
+        return self.carried(field, conjugate=True)
 
-    def carry(
-        self,
-        given: Callable[[slice], Tensor],
-        keep: Callable[[slice, Tensor], None],
-        *,
-        conjugate: bool = False,
-    ) -> None:
-        """The propagation (or its adjoint) band by band; nothing is recorded for gradients.
-
-        Args:
-            given: the field of a band of the own rows, complex (rows, size).
-            keep: called with each band and what arrives there.
-        """
-        size = self.bands.size_px
-        columns = self._to_columns(given)
+    def carried(self, field: Tensor, *, conjugate: bool = False) -> Tensor:
+        """The propagation (or its adjoint) of the own rows; nothing is recorded for gradients."""
+        size, carried = self.bands.size_px, torch.empty_like(field)
+        columns = self._to_columns(lambda band: field[band])
         for block in self._blocks:
-            wave = torch.fft.fft(columns[:, block].T.contiguous().to(self._transfer.device), n=self.length)
+            wave = torch.fft.fft(columns[:, block].T.contiguous(), n=self.length)
             half, rest = self._transfer[block], self.length - self.length // 2 - 1
             # Above the middle frequency stand the same numbers, backwards.
             mirrored = half[:, 1 : rest + 1].flip(1)
@@ -90,21 +79,13 @@ class BandedPropagator:
             columns[:, block] = torch.fft.ifft(wave)[:, :size].T
         rows = self._to_rows(columns)
         for band in self.bands.own():
-            keep(band, torch.fft.ifft(rows[band])[:, :size])
-
-    def _of_tensor(self, field: Tensor, *, conjugate: bool) -> Tensor:
-        carried = torch.empty_like(field)
-
-        def keep(band: slice, wave: Tensor) -> None:
-            carried[band] = wave
-
-        self.carry(lambda band: field[band], keep, conjugate=conjugate)
+            carried[band] = torch.fft.ifft(rows[band])[:, :size]
         return carried
 
     def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
         """Transformed rows, one band after the other, as whole columns: (size, own columns)."""
         bands, ranks = self.bands, self.bands.ranks
-        rows = self.allocate((len(bands.rows()), self.length), torch.complex64)
+        rows = self._room(len(bands.rows()), self.length)
         for band in bands.own():
             rows[band] = torch.fft.fft(given(band), n=self.length)
         if ranks.count == 1:
@@ -125,6 +106,9 @@ class BandedPropagator:
         sizes = [own * width for width in widths]
         got = ranks.exchange(parts, sizes).split(sizes)
         return torch.cat([part.reshape(own, width) for part, width in zip(got, widths, strict=True)], 1)
+
+    def _room(self, *shape: int) -> Tensor:
+        return torch.empty(shape, dtype=torch.complex64, device=self.device)
 
     def _width(self, rank: int) -> int:
         return self._starts[rank + 1] - self._starts[rank]
@@ -169,7 +153,7 @@ class _Carry(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, field: Tensor, propagator: BandedPropagator) -> Tensor:
         ctx.propagator = propagator
-        return propagator._of_tensor(field, conjugate=False)
+        return propagator.carried(field)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:

@@ -8,8 +8,8 @@ from typing import Any, Literal, get_args
 
 from pydantic import model_validator
 
+from litho_data.commands.settings import changed, setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import changed, setting
 from litho_design.images.targets import DrawnTarget, ImagedObject, object_name
 from litho_design.optics import Optics
 from litho_design.optimisation.process_window import ProcessWindow

@@ -60,7 +60,7 @@ class LensTask(Task):
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
-        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+        ensemble: further models in the loss, as for ``Task``.
         pictures: pixels of the objects that are pictures (see ``with_objects``).
 
     Raises:
@@ -256,8 +256,8 @@ def _check(settings: LensSettings) -> None:
     if optics.propagation == "far-field":
         raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
     window = settings.window
-    if radial and window.samples and (window.roughness.sigma_um or window.stitch.sigma_um):
-        got, hint = "a rough surface or displaced write fields", "--set view.path=plane"
+    if radial and window.samples and window.stitch.sigma_um:
+        got, hint = "displaced write fields", "--set view.path=plane"
         raise InputError("search path 'radial'", got=got, wanted="a spread of rings", hint=hint)
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")

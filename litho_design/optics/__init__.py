@@ -20,19 +20,4 @@ if TYPE_CHECKING:
     from litho_design.optics.thin_element import intensity_share as intensity_share
 else:
     # Loaded when used: the command line reads the settings in `Optics` without torch.
-    __all__, __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "ASMPropagator": "litho_design.optics.angular_spectrum",
-            "Optics": "litho_design.optics.thin_element",
-            "RSPropagator": "litho_design.optics.rayleigh_sommerfeld",
-            "RadialPropagator": "litho_design.optics.radial",
-            "blaze_efficiency": "litho_design.optics.stroke",
-            "centred_grid": "litho_design.optics.sampling",
-            "check_distance": "litho_design.optics.sampling",
-            "element_field": "litho_design.optics.thin_element",
-            "intensity_share": "litho_design.optics.thin_element",
-            "make_propagator": "litho_design.optics.propagators",
-            "sampling_limit_um": "litho_design.optics.sampling",
-        },
-    )
+    __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 from litho_design.printers.training import ALLOWED_TIMES, training_share
 
 if TYPE_CHECKING:

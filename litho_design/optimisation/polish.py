@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import Objective
 

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from pydantic import ConfigDict
 
+from litho_data.commands.settings import leaves, setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
-from litho_design.optimisation.roughness import Roughness
 from litho_design.optimisation.stitching import Stitching
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-_UNSEEN_STREAM, _SURFACE_STREAM, _STITCH_STREAM = 1, 2, 3
-_SMOOTH, _IN_PLACE = Roughness(), Stitching()
+_UNSEEN_STREAM, _STITCH_STREAM = 1, 3
+_IN_PLACE = Stitching()
 _SPREADS = (
-    "gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um", "roughness.sigma_um",
-    "stitch.sigma_um",
+    "gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um", "stitch.sigma_um"
 )  # fmt: skip
 
 
@@ -39,6 +38,9 @@ class ProcessWindow(Record):
     printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
     """
 
+    # Older designs also have the roughness of a print.
+    model_config = ConfigDict(extra="ignore")
+
     gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
     gain_offset_correlation: float = setting(0.0, "Correlation of gain and offset", ge=-1, le=1)
@@ -49,7 +51,6 @@ class ProcessWindow(Record):
     wavelength_sd_um: float = setting(
         0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
     )
-    roughness: Roughness = setting(_SMOOTH, "Surface of a print")
     stitch: Stitching = setting(_IN_PLACE, "Write fields of a print")
     samples: int = setting(
         0,
@@ -78,15 +79,8 @@ def spreads(window: ProcessWindow) -> list[str]:
     """Every spread of a window with its value and unit, for reports."""
     told = []
     for leaf in (leaf for leaf in leaves(window) if leaf.path in _SPREADS):
-        values = leaf.value if isinstance(leaf.value, tuple) else (leaf.value,)
-        if values:
-            told.append(f"{leaf.help.removeprefix('Spread of the ')} {_range(values)} {leaf.unit}".strip())
+        told.append(f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip())
     return told
-
-
-def _range(values: Sequence[float]) -> str:
-    low, high = min(values), max(values)
-    return f"{low:g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
 @dataclass(frozen=True)
@@ -97,19 +91,15 @@ class Draw:
     offset_um: float
     blur_um: float
     optics: Optics
-    roughness: Roughness = _SMOOTH
-    surface_seed: tuple[int, ...] = ()
     stitch: Stitching = _IN_PLACE
     stitch_seed: tuple[int, ...] = ()
-    _surfaces: dict[tuple[int, ...], Tensor] = field(default_factory=dict, compare=False, repr=False)
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
         """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
 
         A uniform offset changes no image, only the scores of heights.
         Rings are blurred along the radius only, which is exact where they are much wider than the blur
-        or far from the centre. Of maps only, write fields are put off their places then, and a rough surface
-        is laid on the print.
+        or far from the centre. Of maps only, write fields are put off their places then.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -117,13 +107,7 @@ class Draw:
             changed = blurred(changed, sigma_px)
         if self.stitch.sigma_um:
             changed = self.stitch.drawn(changed, pitch_um, list(self.stitch_seed))
-        if not self.roughness.sigma_um:
-            return changed
-        shape = tuple(height_um.shape)
-        if shape not in self._surfaces:
-            seed = list(self.surface_seed)
-            self._surfaces[shape] = self.roughness.unit_surface(shape, pitch_um, seed).to(height_um.device)
-        return changed + self.roughness.surface_um(height_um, self._surfaces[shape])
+        return changed
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
@@ -134,7 +118,6 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
     # Five numbers a draw: a further spread needs a stream of its own, or all older draws change.
-    surface, fields = ((window.seed, stream, int(unseen)) for stream in (_SURFACE_STREAM, _STITCH_STREAM))
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -144,10 +127,8 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
             optics=optics.at_wavelength(
                 optics.wavelength_um + window.wavelength_sd_um * wavelength
             ).model_copy(update={"distance_um": optics.distance_um + window.defocus_sd_um * defocus}),
-            roughness=window.roughness,
-            surface_seed=(*surface, number),
             stitch=window.stitch,
-            stitch_seed=(*fields, number),
+            stitch_seed=(window.seed, _STITCH_STREAM, int(unseen), number),
         )
         for number, (gain, offset, blur, defocus, wavelength) in enumerate(normal)
     ]

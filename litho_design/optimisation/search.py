@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
 from litho_design.optimisation.checkpoint import (
     SearchState,

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
+from litho_data.commands.settings import changed, setting
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
 from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
@@ -95,7 +95,7 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """With further models in the search, the loss is their mean or worst + weight * disagreement in waves."""
 
-    risk: Literal["mean", "worst"] = setting("mean", "Loss over the models: their mean, or the worst of them")
+    risk: Literal["mean", "worst"] = setting("worst", "Loss over the models: their mean, or the worst")
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )

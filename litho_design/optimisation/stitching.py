@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,19 +44,15 @@ class Stitching(Record):
         return max(1, round(self.field_um / pitch_um))
 
 
-def in_fields(
-    height_um: Tensor, pitch_um: float, field_px: int, offsets_um: np.ndarray, first_row: int = 0
-) -> Tensor:
+def in_fields(height_um: Tensor, pitch_um: float, field_px: int, offsets_um: np.ndarray) -> Tensor:
     """A print whose write fields lie off their places, of the print as if in one piece; differentiable.
 
     A gap between two fields is bare, and where fields overlap the height is their mean: what is written twice
     grows no taller. A pixel that comes to lie across four gives each the share that it covers.
 
     Args:
-        height_um: rows of a print (rows, size), µm.
+        height_um: print (size, size), µm.
         field_px: side of a field; ``offsets_um``: (y, x) of every field, (fields, fields, 2), µm.
-        first_row: of the element, where the rows are a part of it. Near their ends fields from beyond are
-            missing: rows within the largest offset and one more are to be thrown away.
 
     Returns:
         Heights of the same shape.
@@ -66,10 +62,9 @@ def in_fields(
     shape = height_um.shape
     summed, covered = (torch.zeros_like(height_um) for _ in range(2))
     for index in np.ndindex(offsets_um.shape[:2]):
-        top, left = index[0] * field_px - first_row, index[1] * field_px
-        rows, columns = (max(top, 0), min(top + field_px, shape[0])), (left, min(left + field_px, shape[1]))
-        if rows[0] >= rows[1]:
-            continue
+        rows, columns = (
+            (at * field_px, min((at + 1) * field_px, size)) for at, size in zip(index, shape, strict=True)
+        )
         offset_px = offsets_um[index] / pitch_um
         whole = np.floor(offset_px).astype(int)
         share = offset_px - whole

@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
+from litho_data.commands.settings import setting
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
 
 _LARGE_JUMP_LEVELS = 8
 

@@ -11,7 +11,7 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design.printers.fab import is_fab, load_fab
 from litho_design.printers.layout import LayoutSettings
-from litho_design.printers.printer import Printer
+from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
 # The models of the zoo that judge a design: one of each kind. Ridges go astray beyond smooth layouts.
@@ -81,7 +81,7 @@ def load_printers(
 
 
 def models_at_hand(
-    printers: Sequence[Printer], layout: LayoutSettings, *, device: Device = "cpu"
+    known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
     """Judges of the zoo that were trained on the prints of the first of some models, and are none of them.
 
@@ -89,22 +89,20 @@ def models_at_hand(
     """
     from litho_models import load_frozen, zoo
 
-    dataset, known = _dataset(printers[0].card), {str(one.card.get("weights_sha256")) for one in printers}
+    dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
         simulator = load_frozen(zoo.folder(name), device=device)
-        if _dataset(simulator.card) != dataset or str(simulator.card.get("weights_sha256")) in known:
+        printer = Printer(simulator, layout, source=f"{zoo.PREFIX}{name}").to(device)
+        record = printer.record()
+        if record.dataset_sha256 != dataset or record.sha256 in weights:
             continue
         try:
             _check_calibration(simulator.card, layout, extrapolate=False)
         except InputError:
             continue
-        found.append(Printer(simulator, layout, source=f"{zoo.PREFIX}{name}").to(device))
+        found.append(printer)
     return found
-
-
-def _dataset(card: Mapping[str, Any]) -> str:
-    return str((card.get("dataset") or {}).get("sha256", ""))
 
 
 def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from litho_data.foundation.results import Record
 from litho_design.printers.layout import LayoutSettings
@@ -24,10 +24,12 @@ class OutOfDistribution(Record):
     """Distance of a layout from the model's training layouts.
 
     Two total-variation distances: between the histograms of levels, and between those of the steps of
-    neighbouring pixels. ``unusual`` says what the layout has and they have not; ``inside`` holds the scores
-    of a layout that was kept closer to them, as printed, and the next two how close it came. Steps are
-    absent where the card of the model has none.
+    neighbouring pixels. ``unusual`` says what the layout has and they have not. Steps are absent where the
+    card of the model has none.
     """
+
+    # Older designs also have the scores of a layout closer to them.
+    model_config = ConfigDict(extra="ignore")
 
     level_distance: float
     flagged: bool
@@ -35,9 +37,6 @@ class OutOfDistribution(Record):
     training_extreme_level_share: float
     step_distance: float | None = None
     unusual: list[str] = Field(default_factory=list)
-    inside: dict[str, float] | None = None
-    inside_distance: float | None = None
-    inside_step_distance: float | None = None
 
 
 def out_of_distribution(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from litho_data.foundation.settings import changed, setting
+from litho_data.commands.settings import changed, setting
 from litho_design.optimisation.settings import DesignSettings, SearchSettings
 from litho_design.printers.layout import LayoutSettings
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
-from litho_data.foundation.report import Words, spelt_out
+from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
 # Figures whose key, spelt out, says too little; what each is, the descriptions of the scores say.
@@ -25,8 +25,6 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures whose loss is told in dB: already in dB (0), shares of power (10).
-_IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10}
 # Figures that a score is told by, where it has them: what is said, decimals, and a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
@@ -69,29 +67,7 @@ def distribution_warning(design: Design) -> str:
         "have to change level to match them, and the prediction is an extrapolation"
     )
     text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
-    return text + _cost_of_staying_inside(design)
-
-
-def _cost_of_staying_inside(design: Design) -> str:
-    """What a layout closer to the training layouts scores, in dB where that makes sense; or nothing."""
-    gauge = design.out_of_distribution
-    if gauge is None or gauge.inside is None or gauge.inside_distance is None:
-        return ""
-    told = []
-    for name, scale in _IN_DB.items():
-        now, then = design.predicted.get(name, 0.0), gauge.inside.get(name, 0.0)
-        if min(now, then) > 0:
-            lost = now - then if scale == 0 else scale * math.log10(now / then)
-            more = "less" if lost >= 0 else "more"
-            told.append(f"{abs(lost):.2f} dB {more} {named(name).removesuffix(' (dB)')}")
-    if not told:
-        for key, now in list(gauge.inside.items())[:2]:
-            name, _, unit = named(key).partition(" (")
-            told.append(f"{name} {now:.3g} {unit.rstrip(')')} instead of {design.predicted[key]:.3g}")
-    return (
-        f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends "
-        f"with {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
-    )
+    return f"{text}. --inside-weight keeps a search closer to them"
 
 
 def width_sentence(design: Design) -> str:
@@ -99,24 +75,37 @@ def width_sentence(design: Design) -> str:
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
         return ""
-    name, _, unit = named(width.figure).partition(" (")
-    unit = f" {unit.rstrip(')')}" if unit else ""
-    models = list(width.level_heights_um)
-    stated, median, worst = width.stated_median_worst
-    by = models[int(width.values().argmax() if width.less else width.values().argmin())]
-    text = (
-        f"{len(models)} models of this printer print it ({', '.join(models)}; {width.searched_with} of them "
-        f"in the search): {name} {stated:.3g}{unit} as stated by {models[0]}, {median:.3g} in the median, "
-        f"{worst:.3g} at worst, by {by}"
-    )
+    by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
+    text = spread_sentence(width.figure, by_model, width.less, width.gain)
+    text += f" The search used {width.searched_with} of them."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
-            f". They disagree by {width.disagreement:.3g}{unit}, more than the {width.gain:.3g} that the "
-            f"design gains over doing nothing. They differ most about level {level} ({low_um:.3f} to "
-            f"{high_um:.3f} µm): a print with wide fields of it would decide (litho-models next-print)"
+            f" They differ most about level {level} ({low_um:.3f} to {high_um:.3f} µm): a print with wide "
+            "fields of it would decide (litho-models next-print)."
         )
-    return text + "."
+    return text
+
+
+def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
+    """A figure as the first model states it, in the median and at worst, and whether models differ by more.
+
+    Args:
+        less: whether the figure is better when lower; ``gain``: what the design gains over doing nothing.
+    """
+    name, _, unit = named(figure).partition(" (")
+    unit = f" {unit.rstrip(')')}" if unit else ""
+    stated, *_ = by_model
+    worst = (max if less else min)(by_model, key=by_model.__getitem__)
+    text = (
+        f"{len(by_model)} models of this printer print it ({', '.join(by_model)}): {name} "
+        f"{by_model[stated]:.3g}{unit} as stated by {stated}, {median(by_model.values()):.3g} in the median, "
+        f"{by_model[worst]:.3g} at worst, by {worst}."
+    )
+    apart = max(by_model.values()) - min(by_model.values())
+    if gain is not None and apart > gain:
+        text += f" They disagree by {apart:.3g}{unit}, more than the {gain:.3g} gained over doing nothing."
+    return text
 
 
 def thickness_warning(design: Design) -> str:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
 from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice, width_sentence
-from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
+from litho_design.reports.lens import add_lens_curves, decibels
 from litho_design.reports.parts import (
     BRIGHTEST,
     add_gauge,
@@ -38,8 +38,6 @@ _TITLES = {
     "lens-computational": "Multi-level diffractive lens with deconvolution",
     "relief": "Corrected relief",
 }
-# Units that stand with the value of a tile.
-_UNITS = ("nm", "µm", "dB")
 _PSF = " The PSF is in decibels below its peak."
 
 
@@ -76,7 +74,6 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         page.table(
             rows, "The layout and those of doing nothing, by every model at hand", "width.csv", digits=4
         )
-    page.tiles([*_tiles(design, task), (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke")])
     page.heading("All scores", folded=True)
     labels = meanings(task.score_type)
     if isinstance(task, LensTask):
@@ -102,8 +99,6 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     add_yield(
         page, draws, window, figures, measure_yield(draws, design.predicted, window, task.errors), task.errors
     )
-    if isinstance(task, LensTask):
-        add_lens_window(page, task.bench, print_um)
     page.heading("Printed height of the levels", folded=True)
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
@@ -111,22 +106,6 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.heading("Settings", folded=True)
     page.code(design.model_dump_json(indent=1, include={"settings", "printer", "target"}))
     return page.write(folder)
-
-
-def _tiles(design: Design, task: Task) -> list[tuple[str, str]]:
-    """The first figures, with the baseline without which an SSIM or a ratio says nothing."""
-    labels = meanings(task.score_type)
-    black = (design.baselines or {}).get("black image", {})
-    tiles = []
-    for name in (task.headline or tuple(design.predicted))[:5]:
-        value, label = design.predicted[name], labels.get(name, named(name))
-        more = f" (black image {black[name]:.3f})" if name in black and name.startswith("ssim") else ""
-        ceiling = design.predicted.get(f"{name}_ceiling")
-        more += f" (ceiling {ceiling:.3g})" if ceiling else ""
-        what, _, unit = label.rpartition(", ")
-        of, unit = (what, f" {unit}") if unit in _UNITS else (label, "")
-        tiles.append((f"{value:.1f}{unit}" if abs(value) >= 10 else f"{value:.3f}{unit}", of + more))
-    return tiles
 
 
 def _add_reference(page: Page, design: Design, task: Task) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import Page, capitalised
+from litho_data.reports.page import Page, capitalised
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.printer import Printer

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import model_colour, new_figure
+from litho_data.reports.page import Page, capitalised
 from litho_design.holograms.bench import HologramScore
 from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
 from litho_design.judging.loaded import LoadedDesign, task_named
@@ -23,8 +21,6 @@ from litho_design.tasks.design import Design
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Side of the cut-out that shows layout against print; features of some pixels must stay visible.
-_DETAIL_PX = 160
 # With fewer, an interval over seeds is missing or says nothing.
 _FEWEST_SEEDS = 3
 # Of each arm a design, and the image that each judge's print gives.
@@ -74,7 +70,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     page.heading("Further figures", folded=True)
     for figure in shown[1:]:
         page.table(_matrix(result, figure), _caption(result.task, figure), f"matrix_{figure}.csv", digits=3)
-    page.heading("Layouts, prints and what they cost", folded=True)
+    page.heading("Reports of the designs", folded=True)
     page.links(
         [
             (
@@ -84,21 +80,6 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
             for arm in result.arms
             for seed in result.seeds
         ]
-    )
-    page.figure(
-        _prints(result, judged, printers),
-        f"Seed {result.seeds[0]}: layout and prints in the middle of the element, all on one scale.",
-    )
-    if result.task.startswith("lens-"):
-        page.figure(
-            _profiles(result, judged),
-            f"Seed {result.seeds[0]}: PSF across the centre and its Fourier spectrum along x (MTF × power); "
-            "thick in design, thin as printed.",
-        )
-    page.figure(
-        _bars(result, "ssim" if result.task == "hoe" else shown[0]),
-        "First: expected in design (circles) and after each judge's print (bars), means over seeds. Second: "
-        "design minus print, the gap.",
     )
     if result.paired:
         page.heading("Arm against arm", folded=True)
@@ -197,64 +178,3 @@ def _pictures(judged: _Judged) -> Figure:
         for arm, (loaded, by_judge) in judged.items()
     }
     return picture_grid(rows, next(iter(judged.values()))[0].window_um)
-
-
-def _prints(result: GapResult, judged: _Judged, printers: Mapping[str, Printer]) -> Figure:
-    """The layout (nominal heights) and what every judge prints of it, cut out around the centre."""
-    layout = result.settings.layout
-    side = min(layout.size_px, _DETAIL_PX)
-    first = (layout.size_px - side) // 2
-    middle = (slice(first, first + side), slice(first, first + side))
-    rows = {}
-    for arm, (loaded, _) in judged.items():
-        maps = {"layout, nominal": loaded.level * layout.level_height_um}
-        maps |= {f"printed by {name}": loaded.printed_um(printer) for name, printer in printers.items()}
-        rows[f"designed with {arm}"] = {name: one.cpu().numpy()[middle] for name, one in maps.items()}
-    highest_um = max(float(one.max()) for maps in rows.values() for one in maps.values())
-    return picture_grid(rows, side * layout.pitch_um, "viridis", highest_um, "height, µm")
-
-
-def _profiles(result: GapResult, judged: _Judged) -> Figure:
-    figure = new_figure(9, 2.6 * len(judged))
-    axes = figure.subplots(len(judged), 2, squeeze=False, sharey="col")
-    for (arm, (_, by_judge)), (left, right) in zip(judged.items(), axes, strict=True):
-        for name, psf in by_judge.items():
-            pitch = result.settings.layout.pitch_um
-            x = (np.arange(psf.shape[0]) - (psf.shape[0] - 1) / 2) * pitch
-            width = 2.5 if name == arm else 1.0
-            label = f"{name} (design)" if name == arm else name
-            left.plot(x, psf[psf.shape[0] // 2], linewidth=width, color=model_colour(name), label=label)
-            spectrum = np.abs(np.fft.rfft(psf.sum(0)))
-            frequency = np.fft.rfftfreq(psf.shape[0], pitch)
-            right.plot(frequency, spectrum, linewidth=width, color=model_colour(name))
-        left.set(xlim=(-6, 6), ylabel=f"designed with {arm}\nshare per pixel")
-        left.legend(fontsize=7)
-        right.set(xlim=(0, 0.6), ylabel="|spectrum|")
-    axes[-1, 0].set_xlabel("x, µm")
-    axes[-1, 1].set_xlabel("cycles/µm")
-    return figure
-
-
-def _bars(result: GapResult, name: str) -> Figure:
-    """Left: one figure in design and after each judge's print; right: what the print cost of it."""
-    figure = new_figure(12, 3.8)
-    left, right = figure.subplots(1, 2)
-    judges, arms = list(result.judges), list(result.arms)
-    width = 0.8 / len(arms)
-    for index, arm in enumerate(arms):
-        items = [item for item in result.summary if item.arm == arm and item.figure == name]
-        place = np.arange(len(judges)) + (index - (len(arms) - 1) / 2) * width
-        half = [0.0 if i.judged_ci95 is None else i.judged_ci95[1] - i.judged_mean for i in items]
-        error = {"yerr": half, "capsize": 2} if any(half) else {}
-        colour = model_colour(arm)
-        left.bar(place, [item.judged_mean for item in items], width, color=colour, label=arm, **error)
-        left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
-        right.bar(place, [item.gap_mean for item in items], width, color=colour)
-    left.set_ylabel(textwrap.fill(_LABELS.get(name, name), 32))
-    right.set_ylabel(textwrap.fill(f"Δ {_LABELS.get(name, name)}", 32))
-    right.axhline(0, color="black", linewidth=0.8)
-    for axis in (left, right):
-        axis.set_xticks(range(len(judges)), judges, fontsize=8)
-        axis.set_xlabel("printed by")
-    figure.legend(title="designed with", ncols=len(arms), fontsize=8, loc="outside upper center")
-    return figure

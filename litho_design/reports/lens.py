@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
 from litho_design.lenses.bench import LensBench
-from litho_design.lenses.focus_window import focus_window
 from litho_design.lenses.score import mtf
 from litho_design.tasks.design import Design
 
@@ -54,37 +52,3 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
     for axis in axes:
         axis.legend(fontsize=8)
     return figure
-
-
-def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
-    """Bossung curves of FWHM and peak, and the map of the peak."""
-    window = focus_window(bench, height_um)
-    page.heading("Focus and dose", folded=True)
-    page.paragraph(
-        "Focus and print gain (which represents the dose) are swept. The peak stays above 80 % of its best "
-        f"value over {window.depth_of_focus_um:.1f} µm of defocus at the modelled gain and over a gain range "
-        f"of {window.gain_latitude:.2f} in focus; both ranges end with the sweep."
-    )
-    strehl, width = np.array(window.strehl), np.array(window.fwhm_um)
-    figure = new_figure(13, 3.6)
-    axes = figure.subplots(1, 3)
-    for row, gain in enumerate(window.gain):
-        for axis, values in ((axes[0], width), (axes[1], strehl)):
-            axis.plot(window.defocus_um, values[row], marker="o", markersize=3, label=f"gain {gain:g}")
-    axes[0].set_ylabel("FWHM, µm")
-    axes[1].set_ylabel("peak over that of a perfect lens")
-    axes[1].legend(fontsize=8)
-    share = strehl / strehl.max()
-    shown = axes[2].contourf(window.defocus_um, window.gain, share, levels=np.linspace(0, 1, 11))
-    axes[2].contour(window.defocus_um, window.gain, share, levels=[0.8], colors="#fefefe")
-    axes[2].set_ylabel("print gain over the modelled one")
-    figure.colorbar(shown, ax=axes[2], label="peak over the best of the sweep")
-    for axis in axes:
-        axis.set_xlabel("defocus, µm")
-    page.figure(figure, "First and second: one curve per gain. Third: the window, its 80 % line in white.")
-    rows = [
-        {"gain": gain, "defocus_um": shift, "strehl": strehl[row, column], "fwhm_um": width[row, column]}
-        for row, gain in enumerate(window.gain)
-        for column, shift in enumerate(window.defocus_um)
-    ]
-    page.table(rows, "Sweep", "focus_window.csv", digits=3)

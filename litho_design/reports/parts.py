@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.results import Record
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
 from litho_design.reports.advice import (
     distribution_warning,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import Judgement, ScoreResult
-from litho_design.reports.advice import WORDS, headline
+from litho_design.reports.advice import WORDS, headline, spread_sentence
 from litho_design.reports.parts import meanings, picture_grid, score_table
 
 
@@ -77,7 +77,17 @@ def _verdict(result: ScoreResult) -> str:
         for score in result.scores
         if score.independent
     ]
-    return f"{expected}Judged independently, by {'; by '.join(told)}."
+    return f"{expected}Judged independently, by {'; by '.join(told)}. {_spread(result)}"
+
+
+def _spread(result: ScoreResult) -> str:
+    """The design's own figure beside those of the models that judge it; empty with fewer than two of them."""
+    task = task_named(result.task)
+    figure = next((one for one in task.headline if one in result.designed), "")
+    judged = {one.judge.name: one.figures.get(figure) for one in result.scores if one.kind == "model"}
+    by_model = {result.designed_with.name: result.designed.get(figure)} | judged
+    known = {name: value for name, value in by_model.items() if value is not None}
+    return spread_sentence(figure, known, figure in task.errors, result.gain) if len(known) > 2 else ""
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:

@@ -29,6 +29,7 @@ from litho_design.optimisation.process_window import Draw, check_draws, draws, r
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.bench import ViewsBench
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -38,7 +39,6 @@ from litho_design.tasks.design import (
     write_arrays,
     write_level_image,
 )
-from litho_design.tasks.staying_inside import cost_of_staying_inside
 
 
 class Figures(Record):
@@ -69,7 +69,8 @@ class Task:
         settings: geometry, optics, search, process window.
         printer: frozen model, or nominal heights.
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+        ensemble: further models: the loss is the worst over all, or the mean, plus a penalty on what they
+            disagree about.
 
     Raises:
         InputError: a start that the task does not have, or spreads beyond the range of the propagator.
@@ -210,7 +211,7 @@ class Task:
             tiling=self.printer.tiling_check(whole),
             ensemble=measure_disagreement(self.printers, whole, settings.optics.wave_height_um),
             printability=printability(levels, layout),
-            out_of_distribution=cost_of_staying_inside(self, level),
+            out_of_distribution=out_of_distribution(levels, layout, self.printer.card),
             reference_efficiency=self.reference_efficiency(height_um),
             predicted=self.score(height_um).model_dump(),
             baselines=self.baselines(),

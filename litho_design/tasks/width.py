@@ -34,12 +34,6 @@ class Width(Record):
         return np.array([figures[self.figure] for figures in by_model])
 
     @property
-    def stated_median_worst(self) -> tuple[float, float, float]:
-        """The figure by the first model, the median of all, and the worst."""
-        values = self.values()
-        return float(values[0]), float(np.median(values)), float(values.max() if self.less else values.min())
-
-    @property
     def gain(self) -> float | None:
         """How much better the figure is than the best of doing nothing, the median over models."""
         sign = -1 if self.less else 1

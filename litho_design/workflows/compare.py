@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target

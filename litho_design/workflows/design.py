@@ -41,7 +41,6 @@ def design_hologram(
     out: str | Path,
     *,
     settings: HologramSettings | None = None,
-    ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = False,
     band_px: int | None = None,
@@ -56,11 +55,10 @@ def design_hologram(
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        ensemble: further models, MODEL or NAME=MODEL: the loss is the mean over all models, plus a
-            penalty on their disagreement.
-        judges: models that print the finished layout, the width of the design; those of the zoo that were
-            trained on the same prints by default.
-        robust: search with the judges for the layout whose worst loss is the lowest, instead of printing it.
+        judges: models, MODEL or NAME=MODEL, that print the finished layout, the width of the design; those of
+            the zoo that were trained on the same prints by default.
+        robust: search through the judges as well, as far as they have gradients: for the lowest worst (or
+            mean: ``ensemble.risk``) loss, plus a penalty on the models' disagreement.
         band_px: rows of a band at most: designs in bands, for elements beyond the memory of a process. Those
             that torchrun starts share them; with ``cuda`` each takes a GPU of its own. The one model has a
             finite reach then, and nothing else prints the layout.
@@ -77,17 +75,17 @@ def design_hologram(
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
     if band_px is not None:
-        judges, ranks = _alone(ensemble, judges, robust), Ranks.joined()
+        judges, ranks = _alone((), judges, robust), Ranks.joined()
         bands = Bands(made.layout.size_px, band_px, ranks, made.layout.cell_px)
         device = ranks.device(device)
 
-    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+    def task(printer: Printer, others: list[Printer]) -> Task:
         wanted = load_target(target, made.layout.size_px)
         if band_px is not None:
             return BandedHologram(made, printer, wanted, bands)
-        return HologramTask(_over_worst(made, worst), printer, wanted, others)
+        return HologramTask(made, printer, wanted, others)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 
 
 def design_lens(
@@ -97,7 +95,6 @@ def design_lens(
     settings: LensSettings | None = None,
     objects: Sequence[str | Path] = (),
     held_out_objects: Sequence[str | Path] = (),
-    ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = False,
     tile_px: int | None = None,
@@ -115,7 +112,7 @@ def design_lens(
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
         tile_px: designs the rings of a lens that focuses light along a radius, in tiles of this length;
             nothing of the plane is made, up to 10 mm and more. The model has a finite reach then.
-        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -126,15 +123,15 @@ def design_lens(
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
     if tile_px is not None:
-        judges = _alone((*ensemble, *objects, *held_out_objects), judges, robust)
+        judges = _alone((*objects, *held_out_objects), judges, robust)
 
-    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+    def task(printer: Printer, others: list[Printer]) -> Task:
         if tile_px is not None:
             return RingLens(made, printer, tile_px)
-        imaging, pictures = with_objects(_over_worst(made, worst), objects, held_out_objects)
+        imaging, pictures = with_objects(made, objects, held_out_objects)
         return lens_task(imaging, printer, others, pictures)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 
 
 def correct(
@@ -145,7 +142,6 @@ def correct(
     settings: ReliefSettings | None = None,
     after: str | Path | None = None,
     scan: MeasuredSource | None = None,
-    ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = True,
     device: Device = "cpu",
@@ -161,7 +157,7 @@ def correct(
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction whose print was measured; ``scan``: that measurement. What the
             print was off from its expectation is expected again.
-        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
@@ -172,12 +168,12 @@ def correct(
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
-    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+    def task(printer: Printer, others: list[Printer]) -> Task:
         heights, record = load_relief(relief, made.layout, made.height_um)
         inputs = {"relief_um": heights} | _print_off(made, after, scan)
-        return ReliefTask(_over_worst(made, worst), printer, inputs=inputs, ensemble=others, record=record)
+        return ReliefTask(made, printer, inputs=inputs, ensemble=others, record=record)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 
 
 def _print_off(
@@ -206,7 +202,6 @@ def design(
     *,
     settings: DesignSettings | None = None,
     inputs: Mapping[str, np.ndarray] | None = None,
-    ensemble: Iterable[str | Printer] = (),
     judges: Iterable[str | Printer] | None = None,
     robust: bool = False,
     device: Device = "cpu",
@@ -221,7 +216,7 @@ def design(
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search, process window; ``design_settings()`` by default.
         inputs: arrays that the task needs, by name.
-        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -235,21 +230,18 @@ def design(
     registered_task(task.name)
     made = settings or DesignSettings()
 
-    def of_task(printer: Printer, others: list[Printer], worst: bool) -> Task:
-        return task(_over_worst(made, worst), printer, inputs=inputs, ensemble=others)
+    def of_task(printer: Printer, others: list[Printer]) -> Task:
+        return task(made, printer, inputs=inputs, ensemble=others)
 
-    return _designed(
-        of_task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate
-    )
+    return _designed(of_task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 
 
 def _designed(
-    make: Callable[[Printer, list[Printer], bool], Task],
+    make: Callable[[Printer, list[Printer]], Task],
     layout: LayoutSettings,
     out: str | Path,
     announce: bool,
     model: str | Path | Printer,
-    ensemble: Iterable[str | Printer],
     judges: Iterable[str | Printer] | None,
     robust: bool,
     device: Device,
@@ -258,29 +250,23 @@ def _designed(
     """The design of a task, made when its printers are there: they are refused before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
-    others = list(load_printers(ensemble, layout, **fit).values())
     rivals = (
-        models_at_hand([printer, *others], layout, device=device)
+        models_at_hand([printer.record()], layout, device=device)
         if judges is None
         else list(load_printers(judges, layout, **fit).values())
     )
     in_search = [one for one in rivals if robust and not one.only_judges]
-    task = make(printer, others + in_search, bool(in_search))
+    task = make(printer, in_search)
     task.judges = [one for one in rivals if one not in in_search]
     return run_design(task, out, write_design_report, announce=announce)
 
 
-def _alone(others: Iterable[Any], judges: Iterable[Any] | None, robust: bool) -> tuple[()]:
+def _alone(objects: Iterable[Any], judges: Iterable[Any] | None, robust: bool) -> tuple[()]:
     """The judges of a large element: none."""
-    if robust or tuple(others) or judges:
-        got = "objects, an ensemble or judges"
+    if robust or tuple(objects) or judges:
+        got = "objects or judges"
         raise InputError("large element", got=got, wanted="one design through one model")
     return ()
-
-
-def _over_worst(settings: S, worst: bool) -> S:
-    ensemble = settings.ensemble.model_copy(update={"risk": "worst"})
-    return settings.model_copy(update={"ensemble": ensemble}) if worst else settings
 
 
 def _of_kind(settings: S, kind: type[S]) -> S:

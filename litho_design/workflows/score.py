@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
 from litho_design.large.lens import judge_rings
-from litho_design.large.score import judge_from_disk
+from litho_design.large.score import judge_in_bands
 from litho_design.optics.thin_element import ElementKind
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
-from litho_design.printers.source import Device, load_printers
+from litho_design.printers.source import Device, load_printers, models_at_hand
 from litho_design.reports.score import write_score_report
 from litho_design.tasks.design import Design
 
@@ -23,7 +24,7 @@ def score(
     design: str | Path | LoadedDesign,
     out: str | Path,
     *,
-    judges: Iterable[str | Printer] = (),
+    judges: Iterable[str | Printer] | None = None,
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
     element: ElementKind | None = None,
@@ -40,14 +41,15 @@ def score(
         design: its folder, or what ``load_design`` gives.
         out: folder of the score.
         judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Those
-            with the weights of the design's own model are marked as not independent.
+            with the weights of the design's own model are marked as not independent. Without judge, scan and
+            photograph the models of the zoo that were trained on the same prints.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
         element: ``thick`` judges every print by the wave propagation method; ignored for a design that is
             loaded.
         stitch: write fields that the prints of the judges are made of, each off its place.
-        band_px: rows of a band at most, to score a hologram of any size band by band, the rest on disk.
+        band_px: rows of a band at most, to print and score a large hologram band by band.
         device: where prints and waves are computed; ignored for a design that is loaded.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
@@ -68,7 +70,11 @@ def score(
         loaded = LoadedDesign(folder, device=device, element=element)
     if loaded is not None:
         record, device = loaded.record, loaded.device
-    printers = list(load_printers(judges, record.layout, device=device, extrapolate=extrapolate).values())
+    if judges is None and scan is None and camera is None and not in_parts:
+        printers = models_at_hand([record.printer], record.layout, device=device)
+    else:
+        fit: Any = {"device": device, "extrapolate": extrapolate}
+        printers = list(load_printers(judges or (), record.layout, **fit).values())
     if not printers and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
     with growing_folder(out, ScoreResult.FILE_NAME):
@@ -77,7 +83,7 @@ def score(
         elif band_px is None:
             judgement = judge_rings(folder, record, printers)
         else:
-            judgement = judge_from_disk(folder, record, printers, band_px, stitch, Path(out))
+            judgement = judge_in_bands(folder, record, printers, band_px, stitch)
         result = ScoreResult.of(folder, record, judgement.scores)
         write_score_report(Path(out), result, judgement)
         result.write(out)

@@ -9,13 +9,11 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
+from litho_data.commands.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
+from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import assigned
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.cli.check import check
-from litho_models.cli.loop import close_loop
-from litho_models.cli.next_print import next_print
+from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
@@ -29,15 +27,17 @@ app.add_typer(zoo, name="zoo")
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
 Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 PolicyOption = Annotated[
-    Literal["none", "offset", "offset-gain", "full", "full+rows"],
-    typer.Option(help="terms fitted to each scan for its datum-free error"),
+    Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
+    typer.Option(
+        help="terms fitted to each scan for its datum-free error; offset by default, for films none"
+    ),
 ]
 _BACKGROUND_HELP = (
     "training: add the smooth background that the training scans share to predictions of measured maps"
 )
-BackgroundOption = Annotated[Literal["training", "none"], typer.Option(help=_BACKGROUND_HELP)]
+BackgroundOption = Annotated[Literal["training", "none"] | None, typer.Option(help=_BACKGROUND_HELP)]
 SharedOption = Annotated[
-    Literal["training", "shared", "none"],
+    Literal["training", "shared", "none"] | None,
     typer.Option(help=f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
 ]
 NoiseOption = Annotated[
@@ -86,7 +86,7 @@ def train(
         str,
         typer.Option(
             help="identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
-            "pbl or fno"
+            "e-beam, pbl or fno"
         ),
     ],
     out: Out,
@@ -124,8 +124,8 @@ def evaluate(
     model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
     store: StorePath,
     out: Out,
-    policy: PolicyOption = "offset",
-    background: BackgroundOption = "training",
+    policy: PolicyOption = None,
+    background: BackgroundOption = None,
     noise: NoiseOption = None,
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
@@ -143,6 +143,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
+    from litho_models.evaluation.tables import evaluation_verdict
 
     result = litho_models.evaluate(
         model,
@@ -156,6 +157,9 @@ def evaluate(
     )
     scores = result.scores
     typer.echo(lock_box_text(result.split))
+    if scores.seen_by == "sem":
+        typer.echo(evaluation_verdict(result))
+        return
     typer.echo(
         f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
         f"mae_abs {scores.mae_abs_nm:.2f} nm; "
@@ -182,8 +186,8 @@ def benchmark(
         int | None,
         typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default", hidden=True),
     ] = None,
-    policy: PolicyOption = "offset",
-    background: SharedOption = "training",
+    policy: PolicyOption = None,
+    background: SharedOption = None,
     noise: NoiseOption = None,
     open_lock_box: Annotated[
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
@@ -281,12 +285,11 @@ def list_zoo() -> None:
     Example: litho-models zoo list
     """
     from litho_models.frozen.card import ModelCard
-    from litho_models.frozen.readme import error_text
 
     zoo = litho_models.zoo
     for name in zoo.list():
         card = ModelCard.read(zoo.folder(name))
-        error = error_text(card.held_out) if card.held_out else "no held-out error"
+        error = card.held_out.text if card.held_out else "no held-out error"
         best = f"  = {zoo.PREFIX}{zoo.BEST}" * (zoo.folder(name) == zoo.folder(zoo.BEST))
         typer.echo(f"{zoo.PREFIX + name:20} {error}, {card.parameters:,} parameters{best}")
 

@@ -1,4 +1,4 @@
-"""`litho-models close-loop`: from residual to cause to a better model."""
+"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, what would tell, is it still so?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import DaskOption, WorkersOption
+from litho_data.commands.app import DaskOption, WorkersOption
 
 
 def close_loop(
@@ -80,4 +80,102 @@ def close_loop(
         typer.echo(f"  {effect_text(one)}")
     for decision in result.decisions:
         typer.echo(f"  {decision_text(decision)}")
+    typer.echo(f"report: {out / 'report.html'}")
+
+
+# Neither bad input (2) nor a defect of ours (1).
+EXIT_ALARM = 3
+
+
+def check(
+    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
+    store: Annotated[Path, typer.Argument(help="dataset store of the new prints")],
+    out: Annotated[Path, typer.Option("--out", help="folder for check.json, report and tables")],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="store of unchanged prints; the prints in the model's card by default"),
+    ] = None,
+    new: Annotated[
+        list[str] | None,
+        typer.Option(help="a print of STORE that is new, the others are the reference; repeatable"),
+    ] = None,
+    residuals: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="folder of `benchmark` on the reference prints: errors of prints that no fit had seen"
+        ),
+    ] = None,
+    false_alarms: Annotated[
+        float, typer.Option(help="share of unchanged data sets that raise an alarm")
+    ] = 0.005,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="largest drift of a figure, 0.05 is 5 %; by default three times its spread"),
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help=f"end with exit code {EXIT_ALARM} on an alarm")
+    ] = False,
+) -> None:
+    """Tell whether new prints differ from those a model was made of, and when to measure again.
+
+    Example: litho-models check printer new-prints.zarr --out check
+    """
+    from litho_models.monitoring import check as check_prints
+
+    result = check_prints(
+        model,
+        store,
+        out,
+        reference=reference,
+        new=new or (),
+        residuals=residuals or (),
+        false_alarms=false_alarms,
+        tolerance=tolerance,
+    )
+    for sentence in [*result.verdict, *result.notes]:
+        typer.echo(sentence)
+    typer.echo(f"report {out / 'report.html'}")
+    if strict and result.alarm:
+        raise typer.Exit(EXIT_ALARM)
+
+
+def next_print(
+    loop: Annotated[Path, typer.Argument(help="folder of litho-models close-loop")],
+    out: Annotated[
+        Path, typer.Option("--out", help="folder of the plan: card, layouts, table of scans, sheets, report")
+    ],
+    prints: Annotated[int, typer.Option("--prints", min=1, help="prints to plan, references apart")] = 4,
+    field_um: Annotated[float, typer.Option("--field-um", min=1.0, help="side of a print, µm")] = 51.2,
+    layouts: Annotated[
+        Literal["optimised", "random"],
+        typer.Option("--layouts", help="random: a control, the same scans of layouts with nothing optimised"),
+    ] = "optimised",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the random layouts to start from")] = 0,
+    steps: Annotated[int, typer.Option("--steps", min=0, help="of the ascent of each tile")] = 40,
+) -> None:
+    """Plan the prints and scans that decide what a closed loop left open; resumes after a kill.
+
+    Example: litho-models next-print loop --out plan
+    """
+    from litho_models.planning.run import next_print as plan_next_print
+
+    plan = plan_next_print(
+        loop,
+        out,
+        prints=prints,
+        field_um=field_um,
+        seed=seed,
+        steps=steps,
+        layouts=layouts,
+        report=lambda message: typer.echo(message, err=True),
+    )
+    if plan is None:
+        typer.echo(f"nothing is open in {loop}: no print is needed")
+        return
+    typer.echo(f"{plan.prints} print{'s' * (plan.prints > 1)}, {len(plan.scans)} scans with the references")
+    for question in plan.questions:
+        needed = f", {question.prints_needed} prints for 0.95" if question.prints_needed else ""
+        power = f"power {question.power[plan.prints - 1]:.2f}{needed}"
+        told = question.text if question.kind == "fact" else power
+        typer.echo(f"  {question.name}: {question.status}; {told}")
     typer.echo(f"report: {out / 'report.html'}")

@@ -92,6 +92,13 @@ class FieldContext:
     new_tip: bool = False
     pixel_size: float = 1.0
     dose: float = 1.0
+    _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
+        """What an effect makes of the field alone, whatever its numbers: made once."""
+        if name not in self._kept:
+            self._kept[name] = make(self)
+        return self._kept[name]
 
     def in_scan_frame(self) -> FieldContext:
         """The same field as the microscope saw it, its fast axis along x."""

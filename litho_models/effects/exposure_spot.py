@@ -89,15 +89,20 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     The step is logistic about the threshold and maps 0 to 0 and 1 to 1: a slice narrower than the
     spot is lost, a gap narrower than it is filled, which a column of many slices would average out.
     """
+    exposed = context.kept("slices", _exposed_slices)
+    gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
+    return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)
+
+
+def _exposed_slices(context: FieldContext) -> Tensor:
+    """Exposure (slices, 1, y, x) of each slice through the spot, 1 where it is exposed in full."""
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
     # Another dose is another exposure of as many slices.
     number = layout / (context.dose * context.slice_um)
     slices = context.dose * torch.clamp(number - torch.arange(count).to(layout)[:, None, None], 0, 1)
     slices = slices.reshape(count, 1, *layout.shape[-2:])
-    exposed = add_blur(slices, layout.new_tensor(_SLICED_VARIANCE_UM2), context.pitch_um, _SLICED_REACH_UM)
-    gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
-    return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)
+    return add_blur(slices, layout.new_tensor(_SLICED_VARIANCE_UM2), context.pitch_um, _SLICED_REACH_UM)
 
 
 def _step(dose: Tensor, threshold: Tensor, steepness: Tensor) -> Tensor:

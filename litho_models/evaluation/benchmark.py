@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.commands import progress, say_estimate
+from litho_data.commands.progress import progress, say_estimate
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256
@@ -31,9 +31,9 @@ from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.models import build_model, require_models
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
+from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import estimated_floor, stated_floor
-from litho_models.scoring.pairs import paired_scores
-from litho_models.scoring.records import ModelScores, Prediction
+from litho_models.scoring.records import ModelScores, Prediction, paired_scores
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, Fold, ScoredSplit, SplitKind, plan_folds
 
@@ -51,8 +51,8 @@ def benchmark(
     settings: dict[str, Any] | None = None,
     folds: int = GROUPED_FOLDS,
     first_folds: int | None = None,
-    policy: Policy = "offset",
-    background: BackgroundUse = "training",
+    policy: Policy | None = None,
+    background: BackgroundUse | None = None,
     noise: str | Path | None = None,
     open_lock_box: bool = False,
     seed: int = 0,
@@ -70,9 +70,10 @@ def benchmark(
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         first_folds: fit and score only so many of the folds, to compare seeds or settings; None for all.
-        policy: nuisances of ``mae_datum_free_nm``.
-        background: ``training``: each fit's smooth background, learned on its training scans, is added to
-            its predictions; ``shared``: they go through the measurement model, learned there with the fit.
+        policy: nuisances of ``mae_datum_free_nm``; ``offset`` by default, for films ``none``.
+        background: by default ``training``, for films ``none``. ``training``: each fit's smooth background,
+            learned on its training scans, is added to its predictions; ``shared``: they go through the
+            measurement model, learned there with the fit.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
@@ -86,8 +87,11 @@ def benchmark(
     """
     require_models(models)
     dataset = open_store(store)
-    old = _kept_benchmark(Path(out), dataset.name, models, split, seed)
     scans = dataset.scans()
+    film = dataset.instrument == "sem"
+    policy, background = policy or usual_policy(film), background or usual_background(film)
+    if film:
+        settings = {"nuisance": "none", **(settings or {})}
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
@@ -99,70 +103,71 @@ def benchmark(
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")
         plan = [fold for fold in plan if fold.locked or fold.number < first_folds]
     scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
-    if old is not None and (more := set(old.split.scored_ids) - {scan.id for scan in scored}):
-        raise _other_benchmark(Path(out), f"{len(more)} scans more")
-    configs = {name: _config(name, settings, seed) for name in models}
-    fits: dict[tuple[str, int], FitRecord] = {}
-    predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
-    known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
-    places = Workers(workers, dask, known)
-    jobs: list[_Job] = [
-        (name, fold, configs[name], Path(out) / CACHE_FOLDER, background == "shared")
-        for name in models
-        for fold in plan
-    ]
-    done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-    started = time.monotonic()
-    # Models differ too much for one estimate where each tells its own.
-    of = len(jobs) if places.elsewhere else 0
-    for (name, fold, *_), (record, heights) in progress(
-        done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of
-    ):
-        if fold is plan[0] and not of:
-            rest = (len(plan) - 1) * (time.monotonic() - started)
-            say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
+    facts = {"dataset": {"name": dataset.name}, "split": {"kind": split, "seed": seed}}
+    with growing_folder(out, Benchmark.FILE_NAME, facts, holds=CACHE_FOLDER) as begun:
+        _require_no_less(begun.folder, models, scored)
+        configs = {name: _config(name, settings, seed) for name in models}
+        fits: dict[tuple[str, int], FitRecord] = {}
+        predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
+        known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
+        places = Workers(workers, dask, known)
+        jobs: list[_Job] = [
+            (name, fold, configs[name], Path(out) / CACHE_FOLDER, background == "shared")
+            for name in models
+            for fold in plan
+        ]
+        done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
         started = time.monotonic()
-        fits[name, fold.number] = record
-        predicted.setdefault((name, fold.locked), {}).update(
-            (scan.id, expected(record, background, scan, height))
-            for scan, height in zip(fold.held_out, heights, strict=True)
+        # Models differ too much for one estimate where each tells its own.
+        of = len(jobs) if places.elsewhere else 0
+        for (name, fold, *_), (record, heights) in progress(
+            done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of
+        ):
+            if fold is plan[0] and not of:
+                rest = (len(plan) - 1) * (time.monotonic() - started)
+                say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
+            started = time.monotonic()
+            fits[name, fold.number] = record
+            predicted.setdefault((name, fold.locked), {}).update(
+                (scan.id, expected(record, background, scan, height))
+                for scan, height in zip(fold.held_out, heights, strict=True)
+            )
+        protocol = NuisanceProtocol.of_policy(policy, seed, background)
+        boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
+
+        def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
+            own = predicted[name, locked]
+            return score_model(name, judged, [own[scan.id] for scan in judged], protocol)
+
+        scores = [score(name, scored, False) for name in models]
+        ids = [scan.id for scan in scored]
+        maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
+        if noise is None:
+            best = min(scores, key=lambda entry: entry.leading_nm).model
+            floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
+        result = Benchmark(
+            run=run_info([seed], len(scans)),
+            dataset=dataset.dataset_id,
+            split=ScoredSplit(
+                kind=split,
+                folds=made,
+                seed=seed,
+                first_folds=first_folds,
+                scored_ids=ids,
+                scored_ids_sha256=ids_sha256(ids),
+                lock_box=locked,
+                lock_box_opened=open_lock_box or split == "paper",
+            ),
+            nuisance=protocol,
+            noise_floor=floor,
+            training={name: _settings(name, config, scans) for name, config in configs.items()},
+            scores=scores,
+            locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
+            paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
+            fits=[fits[name, fold.number] for name, fold, *_ in jobs],
         )
-    protocol = NuisanceProtocol.of_policy(policy, seed, background)
-    boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
-
-    def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
-        own = predicted[name, locked]
-        return score_model(name, judged, [own[scan.id] for scan in judged], protocol)
-
-    scores = [score(name, scored, False) for name in models]
-    ids = [scan.id for scan in scored]
-    maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
-    if noise is None:
-        best = min(scores, key=lambda entry: entry.mae_datum_free_nm).model
-        floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
-    result = Benchmark(
-        run=run_info([seed], len(scans)),
-        dataset=dataset.dataset_id,
-        split=ScoredSplit(
-            kind=split,
-            folds=made,
-            seed=seed,
-            first_folds=first_folds,
-            scored_ids=ids,
-            scored_ids_sha256=ids_sha256(ids),
-            lock_box=locked,
-            lock_box_opened=open_lock_box or split == "paper",
-        ),
-        nuisance=protocol,
-        noise_floor=floor,
-        training={name: _settings(name, config, scans) for name, config in configs.items()},
-        scores=scores,
-        locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
-        paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
-        fits=[fits[name, fold.number] for name, fold, *_ in jobs],
-    )
-    result.write(out)
-    write_benchmark_report(result, scored, maps, out)
+        write_benchmark_report(result, scored, maps, out)
+        result.write(out)
     return result
 
 
@@ -182,35 +187,18 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
     return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
 
 
-def _kept_benchmark(
-    out: Path, dataset: str, models: Sequence[str], split: SplitKind, seed: int
-) -> Benchmark | None:
-    """What the folder holds: it may be made again or extended; one of something else is not replaced."""
-    require_own_folder(out, Benchmark.FILE_NAME, CACHE_FOLDER)
-    if not (out / Benchmark.FILE_NAME).exists():
-        return None
-    old = Benchmark.read(out)
+def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[PrintedScan]) -> None:
+    """A benchmark may be made again or extended; one with more in it is not replaced."""
+    if not (folder / Benchmark.FILE_NAME).exists():
+        return
+    old = Benchmark.read(folder)
     lost = [score.model for score in old.scores if score.model not in models]
-    other = [
-        f"{name} {then}"
-        for name, then, now in (
-            ("dataset", old.dataset.name, dataset),
-            ("split", old.split.kind, split),
-            ("seed", old.split.seed, seed),
+    more = set(old.split.scored_ids) - {scan.id for scan in scored}
+    held = [f"model {', '.join(lost)}"] * bool(lost) + [f"{len(more)} scans more"] * bool(more)
+    if held:
+        raise InputError(
+            "output",
+            got=f"{folder}, which holds a benchmark of {'; '.join(held)}",
+            wanted="a folder of its own",
+            hint="choose another --out",
         )
-        if then != now
-    ]
-    if lost:
-        other.append(f"model {', '.join(lost)}")
-    if other:
-        raise _other_benchmark(out, "; ".join(other))
-    return old
-
-
-def _other_benchmark(out: Path, what: str) -> InputError:
-    return InputError(
-        "output",
-        got=f"{out}, which holds a benchmark of {what}",
-        wanted="a folder of its own",
-        hint="choose another --out",
-    )

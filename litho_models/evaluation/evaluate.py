@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.diagnostics import device_of, tile_consistency
+from litho_models.evaluation.fit_cache import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen.files import load_frozen
@@ -23,6 +23,7 @@ from litho_models.frozen.on_store import (
 )
 from litho_models.prediction.cost import measured_predictions
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
+from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import stated_floor
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
@@ -34,8 +35,8 @@ def evaluate(
     store: str | Path,
     out: str | Path,
     *,
-    policy: Policy = "offset",
-    background: BackgroundUse = "training",
+    policy: Policy | None = None,
+    background: BackgroundUse | None = None,
     noise: str | Path | None = None,
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
@@ -53,8 +54,9 @@ def evaluate(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances that a scan is freed of.
-        background: whether the background in the model's card is added to the predictions; a card without
+        policy: nuisances that a scan is freed of; ``offset`` by default, for films ``none``.
+        background: ``training`` by default, for films ``none``: whether the background in the model's card is
+            added to the predictions; a card without
             one, or with one of fields of another size, adds none, and the result says so.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
         scan_ids: exactly these scans, locked ones among them too.
@@ -66,49 +68,53 @@ def evaluate(
             other data.
     """
     dataset = open_store(store)
+    film = dataset.instrument == "sem"
+    policy, background = policy or usual_policy(film), background or usual_background(film)
     floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
-    subject = {"dataset.name": dataset.name, "model.name": frozen.name}
-    require_own_folder(out, Evaluation.FILE_NAME, subject=subject)
-    every = dataset.scans()
-    kept = locked_by_the_card(frozen, dataset)
-    locked = sorted({*dataset.locked_ids, *kept})
-    if scan_ids is not None:
-        scans = [dataset.scan(scan_id) for scan_id in scan_ids]
-    else:
-        own = made_of_these_prints(frozen, dataset)
-        scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
-    if not scans:
-        raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
-    ids = [scan.id for scan in scans]
-    learned = card_background(frozen, scans) if background == "training" else None
-    heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
-    predictions = [Prediction.beside(learned, height) for height in heights]
-    protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
-    result = Evaluation(
-        run=run_info([protocol.seed], len(scans)),
-        dataset=dataset.dataset_id,
-        model=ModelRecord(
-            name=frozen.name,
-            sha256=frozen.sha256,
-            extrapolated=extrapolate,
-            parameters=frozen.card["parameters"],
-            tiles=tile_consistency(frozen.simulator, scans[0]),
-            cost=cost,
-        ),
-        split=ScoredSplit(
-            kind="given",
-            scored_ids=ids,
-            scored_ids_sha256=ids_sha256(ids),
-            lock_box=locked,
-            lock_box_opened=not set(locked).isdisjoint(ids),
-        ),
-        nuisance=protocol,
-        noise_floor=floor,
-        trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
-        scores=score_model(frozen.name, scans, predictions, protocol),
-    )
-    result.write(out)
-    write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
+    subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
+    with growing_folder(out, Evaluation.FILE_NAME, subject):
+        every = dataset.scans()
+        kept = locked_by_the_card(frozen, dataset)
+        locked = sorted({*dataset.locked_ids, *kept})
+        if scan_ids is not None:
+            scans = [dataset.scan(scan_id) for scan_id in scan_ids]
+        else:
+            own = made_of_these_prints(frozen, dataset)
+            scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
+        if not scans:
+            raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
+        ids = [scan.id for scan in scans]
+        learned = card_background(frozen, scans) if background == "training" else None
+        heights, cost = measured_predictions(
+            lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen)
+        )
+        predictions = [Prediction.beside(learned, height) for height in heights]
+        protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
+        result = Evaluation(
+            run=run_info([protocol.seed], len(scans)),
+            dataset=dataset.dataset_id,
+            model=ModelRecord(
+                name=frozen.name,
+                sha256=frozen.sha256,
+                extrapolated=extrapolate,
+                parameters=frozen.card["parameters"],
+                tiles=tile_consistency(frozen.simulator, scans[0]),
+                cost=cost,
+            ),
+            split=ScoredSplit(
+                kind="given",
+                scored_ids=ids,
+                scored_ids_sha256=ids_sha256(ids),
+                lock_box=locked,
+                lock_box_opened=not set(locked).isdisjoint(ids),
+            ),
+            nuisance=protocol,
+            noise_floor=floor,
+            trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
+            scores=score_model(frozen.name, scans, predictions, protocol),
+        )
+        write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
+        result.write(out)
     return result

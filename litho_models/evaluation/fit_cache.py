@@ -9,32 +9,113 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from pydantic import Field
 
-from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.evaluation.diagnostics import FitDiagnostics, diagnose
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.models import build_model
-from litho_models.prediction.tiles import predict_scan
+from litho_models.prediction.cost import PredictionCost, measured_predictions
+from litho_models.prediction.tiles import predict_scan, tile_difference
 from litho_models.scan_terms import BackgroundUse
-from litho_models.scan_terms.measurement import learn_measurement
+from litho_models.scan_terms.background import Background, learn_background
+from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
+from litho_models.scoring.metrics import mean_error_nm
 from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
-_FIT, _DIAGNOSTICS, _PREDICTION = "fit.json", "diagnostics.json", "prediction_{:03d}.npy"
+
+class TileConsistency(Record):
+    """The same pixels predicted in the whole field and in a crop of it, nm."""
+
+    max_nm: float
+    rms_nm: float
+    pixels: int
+
+
+class FitDiagnostics(Record):
+    """One fitted model on its own scans and on those held out.
+
+    The three errors are comparable, which shows over-fitting: the mean over scans of the datum-free error of
+    policy ``offset``, without a background. ``inner_validation_nm`` is None for fits without it.
+    ``measurement``: learned with the model, for fits that were freed of it.
+    """
+
+    background: Background
+    measurement: MeasurementModel | None = None
+    training_nm: float
+    inner_validation_nm: float | None
+    held_out_nm: float
+    tiles: TileConsistency | None
+    cost: PredictionCost
+
+
+def diagnose(
+    model: Simulator,
+    scans: Sequence[PrintedScan],
+    validation_ids: Sequence[str],
+    held_out: Sequence[PrintedScan],
+    held_out_um: Sequence[np.ndarray],
+    measured: bool = False,
+) -> FitDiagnostics:
+    """Examine a fitted model.
+
+    Args:
+        model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
+        held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
+        measured: also learn the measurement model beside it.
+    """
+    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
+
+    def error_nm(chose: bool) -> float:
+        own = [one for one in zip(scans, heights, strict=True) if (one[0].id in validation_ids) == chose]
+        return mean_error_nm([scan for scan, _ in own], [height for _, height in own])
+
+    return FitDiagnostics(
+        background=learn_background(scans, heights),
+        measurement=learn_measurement(scans, heights) if measured else None,
+        training_nm=error_nm(False),
+        inner_validation_nm=error_nm(True) if validation_ids else None,
+        held_out_nm=mean_error_nm(held_out, held_out_um),
+        tiles=tile_consistency(model, held_out[0]),
+        cost=cost,
+    )
+
+
+def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileConsistency | None:
+    """Difference between a scan's field and a crop of it that lacks a third of the rows and columns.
+
+    Pixels within the receptive radius of the crop's edge are not compared, nor those within one tile
+    of a model on tiles. None for fields too small to leave any, and for models with effects behind them.
+    """
+    if not isinstance(model, Simulator):
+        return None
+    border = model.tile.size_px if model.tile is not None else model.reach_px or 0
+    offset = scan.shape[0] // 3, scan.shape[1] // 3
+    if any(length - cut <= 2 * border for length, cut in zip(scan.shape, offset, strict=True)):
+        return None
+    layout = torch.from_numpy(scan.layout_um)[None, None].to(device_of(model))
+    return TileConsistency(**tile_difference(model, layout, offset, border)._asdict())
+
+
+def device_of(model: torch.nn.Module) -> str:
+    """Where a model's weights are, as torch names it."""
+    return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
+
+
+_FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(Record):
     """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
 
-    ``at_bounds`` are fitted values on a bound of their range, and that bound. ``diagnostics`` are None in
-    older result files.
+    ``at_bounds`` are fitted values on a bound of their range, and that bound.
     """
 
     model: str
@@ -49,7 +130,7 @@ class FitRecord(Record):
     training_mae_nm: list[float]
     validation_mae_datum_free_nm: list[float | None]
     at_bounds: dict[str, float] = Field(default_factory=dict)
-    diagnostics: FitDiagnostics | None = None
+    diagnostics: FitDiagnostics
 
 
 def fit_or_load(
@@ -68,21 +149,13 @@ def fit_or_load(
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
     key = record_sha256({"fit": key, "background": "shared"}) if measured else key
     folder = fit_folder(cache, name, key)
-    if not ((folder / _FIT).exists() and (folder / _DIAGNOSTICS).exists()):
+    if not (folder / _FIT).exists():
         # A finished training is read from its checkpoint; a small model is fitted again.
         fitted = fit_in_cache(name, fold.training, config, cache)
         if measured:
             fitted = fit_in_cache(name, _freed(fitted.model, fold.training), config, cache)
-        if not (folder / _FIT).exists():
-            _keep_fit(folder, fitted, fold, key)
-        _, heights = kept_fit(folder)
-        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured)
-        with atomic_file(folder / _DIAGNOSTICS) as temporary:
-            temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
-    record, heights = kept_fit(folder)
-    with reading_kept(folder):
-        diagnostics = FitDiagnostics.model_validate_json((folder / _DIAGNOSTICS).read_bytes())
-    return record.model_copy(update={"diagnostics": diagnostics}), heights
+        _keep_fit(folder, fitted, fold, key, measured)
+    return kept_fit(folder)
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
@@ -97,7 +170,7 @@ def expected(
 ) -> Prediction:
     """What a fit expects of a scan: its height (ny, nx), µm, and what its training scans add to theirs."""
     found = record.diagnostics
-    if background == "none" or found is None:
+    if background == "none":
         return Prediction(height_um)
     if background == "shared" and found.measurement is not None:
         return Prediction.seen(found.measurement, scan, height_um)
@@ -110,7 +183,7 @@ def fit_folder(cache: Path, name: str, key: str) -> Path:
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """The record of a fit and its heights (ny, nx) of ``held_out_ids``, µm; without diagnostics.
+    """The record of a fit and its heights (ny, nx) of ``held_out_ids``, µm.
 
     Raises:
         InputError: files that are missing or damaged.
@@ -121,7 +194,8 @@ def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
         return record, [np.load(file, allow_pickle=False) for file in files]
 
 
-def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
+def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool) -> None:
+    heights = [predict_scan(fitted.model, scan) for scan in fold.held_out]
     record = FitRecord(
         model=fitted.model.name,
         fold=fold.number,
@@ -135,8 +209,11 @@ def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
         at_bounds=fitted.model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
+        diagnostics=diagnose(
+            fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured
+        ),
     )
     with atomic_folder(folder) as temporary:
-        for number, scan in enumerate(fold.held_out):
-            np.save(temporary / _PREDICTION.format(number), predict_scan(fitted.model, scan))
+        for number, height in enumerate(heights):
+            np.save(temporary / _PREDICTION.format(number), height)
         (temporary / _FIT).write_text(record.model_dump_json(indent=1), encoding="utf-8")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import LIGHT, model_colour, new_figure
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.reports.pictures import LIGHT, model_colour, new_figure
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ModelScores
@@ -30,23 +30,21 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
     axes = figure.subplots()
     position = np.arange(len(scores))
     colours = [model_colour(s.model) for s in scores]
-    for shift, label, strength, values in (
-        (-0.17, "nothing fitted", 0.4, [(s.mae_abs_nm, s.mae_abs_ci95_nm) for s in scores]),
-        (
-            0.17,
-            "own terms of each scan fitted",
-            1.0,
-            [(s.mae_datum_free_nm, s.mae_datum_free_ci95_nm) for s in scores],
-        ),
-    ):
-        means = np.array([mean for mean, _ in values])
+    bars = [
+        (-0.17, "nothing fitted", 0.4, "mae_abs"),
+        (0.17, "own terms of each scan fitted", 1.0, "leading"),
+    ]
+    if scores[0].seen_by == "sem":
+        bars, floor_nm = [(0.0, "distance of predicted from measured edges", 1.0, "leading")], None
+    for shift, label, strength, error in bars:
+        means = np.array([getattr(s, f"{error}_nm") for s in scores])
         axes.barh(position + shift, means, 0.32, color=colours, alpha=strength)
         axes.fill_between([], [], color="#868d98", alpha=strength, label=label)
-        ends = np.array([ci or (mean, mean) for mean, ci in values])
+        ends = [getattr(s, f"{error}_ci95_nm") or (mean, mean) for s, mean in zip(scores, means, strict=True)]
         axes.errorbar(
             means,
             position + shift,
-            xerr=np.abs(ends.T - means),
+            xerr=np.abs(np.transpose(ends) - means),
             fmt="none",
             ecolor=LIGHT["ink"],
             capsize=3,

@@ -7,17 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
-from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
-from litho_models.evaluation.wording import benchmark_verdict, evaluation_verdict
+from litho_models.evaluation.results import Benchmark, Evaluation
+from litho_models.evaluation.tables import benchmark_verdict, evaluation_verdict
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import ModelScores, ScanRow
+from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
 _WORDS = Path(__file__).with_name("words.toml")
+_OF_PREDICTION = ("tiles_max_nm", "tiles_rms_nm", "cost_seconds_per_scan", "cost_peak_memory_mib")
+_OF_FIT = ("diagnostics_training_nm", "diagnostics_inner_validation_nm", "diagnostics_held_out_nm")
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
@@ -45,7 +47,7 @@ def write_evaluation_report(
         "Error and noise floor.",
     )
     page.paragraph(lock_box_text(result.split))
-    worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
+    worst = max(range(len(scans)), key=list(scores.leading_of_scans_nm.values()).__getitem__)
     shown = {scores.model: predictions_um[worst]}
     page.heading("The worst scan")
     page.figure(plots.residual_maps(scans[worst], shown, result.nuisance), "Measured height and error.")
@@ -55,9 +57,10 @@ def write_evaluation_report(
     _policies(page, [scores], result.nuisance, result.noise_floor)
     _metrics(page, [scores], "Phase, similarity, edges.")
     page.table(
-        _model(result.model),
+        [result.model],
         "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
         "model.csv",
+        columns=("name", "parameters", *_OF_PREDICTION),
     )
     _by_level_and_frequency(page, [scores])
     _all_numbers(page, [scores], "By scan.", "By level.")
@@ -71,7 +74,7 @@ def write_benchmark_report(
     out: str | Path,
 ) -> Path:
     """Render the result into ``out``; ``predictions_um`` is model name -> scan id -> height."""
-    scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
+    scores = sorted(result.scores, key=lambda s: -s.leading_nm)
     best = scores[-1]
     on_paper_data = result.dataset.name == _PAPER_DATASET
     page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=_WORDS)
@@ -89,7 +92,7 @@ def write_benchmark_report(
         page.note(paper_sentence(result.split.kind))
     page.heading("Which differences are more than chance?", folded=True)
     page.table(
-        _pairs(result),
+        result.paired,
         "Error of one model minus that of another over the same scans, with the same terms fitted.",
         "pairs.csv",
         digits=3,
@@ -104,7 +107,7 @@ def write_benchmark_report(
             "lock_box.csv",
         )
     page.heading("One scan", folded=True)
-    middle = _median_scan(best.scans)
+    middle = _median_scan(best)
     shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}
     page.figure(
         plots.residual_maps(scans[middle], shown, result.nuisance),
@@ -125,12 +128,20 @@ def write_benchmark_report(
     _by_level_and_frequency(page, scores)
     page.heading("Training", folded=True)
     page.table(
-        _fits(result),
+        result.fits,
         "Every fit: error on its training, inner-validation and held-out scans, all without a background and "
         "with the zero height of each scan fitted, so that over-fitting shows; the largest and the RMS "
         "difference of the same pixels in another crop; what training and predicting cost here.",
         "fits.csv",
         digits=3,
+        columns=(
+            "model",
+            "fold",
+            *_OF_FIT,
+            "parameters",
+            "seconds",
+            *(f"diagnostics_{c}" for c in _OF_PREDICTION),
+        ),
     )
     curves = [fit for fit in result.fits if len(fit.steps) > 1]
     if curves:
@@ -206,7 +217,6 @@ def _by_level_and_frequency(page: Page, scores: Sequence[ModelScores]) -> None:
         "How far up in frequency the prediction follows the measurement, cycles/µm.",
         "bands.csv",
     )
-    page.paragraph(tables.band_text())
 
 
 def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_level: str) -> None:
@@ -218,46 +228,6 @@ def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_lev
         page.paragraph(note)
 
 
-def _model(model: ModelRecord) -> tables.Rows:
-    assert model.cost is not None, "an evaluation measures its predictions"
-    columns = tables.prediction_columns(model.tiles, model.cost)
-    return [{"model": model.name, "parameters": model.parameters, **columns}]
-
-
-def _pairs(result: Benchmark) -> tables.Rows:
-    rows = []
-    for pair in result.paired:
-        row = pair.model_dump(exclude={"ci95_nm", "over_prints"})
-        row["ci95_nm"] = tables.interval_text(pair.ci95_nm)
-        if pair.over_prints is not None:
-            row["prints"] = pair.over_prints.count
-            row["ci95_over_prints_nm"] = tables.interval_text(pair.over_prints.ci95_nm)
-            row["p_over_prints"] = pair.over_prints.p
-            row["smallest_p_over_prints"] = pair.over_prints.smallest_p
-        rows.append(row)
-    return rows
-
-
-def _fits(result: Benchmark) -> tables.Rows:
-    rows = []
-    for fit in result.fits:
-        found = fit.diagnostics
-        assert found is not None, "a benchmark diagnoses every fit"
-        rows.append(
-            {
-                "model": fit.model,
-                "fold": fit.fold,
-                "training_nm": found.training_nm,
-                "inner_validation_nm": found.inner_validation_nm,
-                "held_out_nm": found.held_out_nm,
-                "parameters": fit.parameters,
-                "training_s": fit.seconds,
-                **tables.prediction_columns(found.tiles, found.cost),
-            }
-        )
-    return rows
-
-
-def _median_scan(rows: Sequence[ScanRow]) -> int:
-    errors = np.array([row.mae_datum_free_nm for row in rows])
+def _median_scan(score: ModelScores) -> int:
+    errors = np.array(list(score.leading_of_scans_nm.values()))
     return int(np.argsort(errors)[len(errors) // 2])

@@ -1,22 +1,27 @@
-"""The results of this room: ``evaluation.json`` of one frozen model, ``benchmark.json`` of many fits."""
+"""``evaluation.json`` of one frozen model, ``benchmark.json`` of many fits, and two of them side by side."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.evaluation.diagnostics import TileConsistency
-from litho_models.evaluation.fit_cache import FitRecord
+from litho_models.evaluation.fit_cache import FitRecord, TileConsistency
 from litho_models.prediction.cost import PredictionCost
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.pairs import Paired
-from litho_models.scoring.records import ModelScores
+from litho_models.scoring.records import ModelScores, Paired, paired_scores
 from litho_models.splits.folds import ScoredSplit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class ModelRecord(Record):
@@ -62,3 +67,99 @@ class Benchmark(Result):
     locked_scores: list[ModelScores] = Field(default_factory=list)
     paired: list[Paired]
     fits: list[FitRecord]
+
+
+@dataclass(frozen=True)
+class ScoredResult:
+    """What two results must agree on to be compared, and their scores by model."""
+
+    path: Path
+    protocol: dict[str, object]
+    scores: dict[str, ModelScores]
+
+
+def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
+    """Datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
+
+    Two benchmarks are compared model by model; an evaluation stands for its one model. A negative
+    difference means that the first is better.
+
+    Raises:
+        InputError: files that cannot be read, different data, folds, scans or nuisances, or a model that
+            was trained on scored scans beside one that was not.
+    """
+    import pandas as pd
+
+    left, right = read_scored(first), read_scored(second)
+    for key, value in left.protocol.items():
+        if right.protocol[key] != value:
+            raise InputError(
+                f"cannot compare {left.path} with {right.path}: {key} differs",
+                got=f"{_short(value)} and {_short(right.protocol[key])}",
+                wanted="the same protocol in both",
+            )
+    common = [name for name in left.scores if name in right.scores]
+    pairs = [(name, name) for name in common] or [
+        (a, b) for a in left.scores for b in right.scores if len(left.scores) == len(right.scores) == 1
+    ]
+    if not pairs:
+        raise InputError(
+            "models of the two results",
+            got=f"{', '.join(left.scores)} and {', '.join(right.scores)}",
+            wanted="at least one in common",
+        )
+    return pd.DataFrame([_row(left.scores[a], right.scores[b]) for a, b in pairs])
+
+
+def read_scored(path: str | Path) -> ScoredResult:
+    """Read a benchmark or an evaluation; a folder stands for the result inside it.
+
+    Raises:
+        InputError: neither of the two.
+    """
+    file = Path(path)
+    if file.is_dir():
+        names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]
+        file = file / (names[0] if names else Benchmark.FILE_NAME)
+    result: Benchmark | Evaluation
+    result = Evaluation.read(file) if _schema(file) == Evaluation.SCHEMA else Benchmark.read(file)
+    split = result.split
+    protocol: dict[str, object] = {
+        "dataset": result.dataset.sha256,
+        "split": split.model_dump(include={"kind", "folds", "seed"}),
+        "scored scans": split.scored_ids_sha256,
+        "held out": isinstance(result, Benchmark) or not result.trained_on_scored_scans,
+        "nuisance": result.nuisance.model_dump(),
+    }
+    scores = result.scores if isinstance(result, Benchmark) else [result.scores]
+    return ScoredResult(file, protocol, {s.model: s for s in scores})
+
+
+def _schema(file: Path) -> object:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content.get("schema") if isinstance(content, dict) else None
+
+
+def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
+    paired = paired_scores(first, second)
+    low, high = paired.ci95_nm or (float("nan"), float("nan"))
+    return {
+        "first": first.model,
+        "second": second.model,
+        "first_nm": first.mae_datum_free_nm,
+        "second_nm": second.mae_datum_free_nm,
+        "difference_nm": paired.mean_nm,
+        "low_nm": low,
+        "high_nm": high,
+        "p": paired.p,
+        "first_better": f"{paired.first_better}/{paired.scans}",
+    }
+
+
+def _short(value: object) -> str:
+    """A hash by its first digits, which are enough to see that it differs."""
+    text = str(value)
+    return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

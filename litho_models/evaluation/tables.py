@@ -1,21 +1,20 @@
-"""Tables that the evaluation and benchmark reports share."""
+"""What the reports of an evaluation and a benchmark say: tables, notes, verdicts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metric_registry import metrics_text, registered_metrics
 from litho_models.scoring.metrics import INDEX_STEP, WAVELENGTH_UM
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import Interval, ModelScores
+from litho_models.scoring.records import Interval, ModelScores, Paired
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_models.evaluation.diagnostics import TileConsistency
-    from litho_models.prediction.cost import PredictionCost
 
 # One mapping a row, column to value.
 Rows = list[dict[str, Any]]
@@ -26,10 +25,13 @@ def headline_table(
 ) -> pd.DataFrame:
     """One row per model: both errors with intervals, what they have above the noise floor, spread and bias.
 
-    Below them the floor itself, under each column that of its own scan terms.
+    Below them the floor itself, under each column that of its own scan terms. Of films the errors of edges
+    and features.
     """
     import pandas as pd
 
+    if scores[0].seen_by == "sem":
+        return pd.DataFrame([_film_row(score) for score in scores])
     below = floor.at(protocol.policy)
     least = floor.mae_at(protocol.policy)
     rows = [
@@ -55,6 +57,20 @@ def headline_table(
         "scans": "",
     }
     return pd.DataFrame([*rows, known])
+
+
+def _film_row(score: ModelScores) -> dict[str, Any]:
+    return {
+        "model": score.model,
+        "edge_mean_nm": score.edge_mean_nm,
+        "edge_mean_ci95_nm": interval_text(score.edge_mean_ci95_nm),
+        "edge_p95_nm": score.edge_p95_nm,
+        **score.metrics,
+        "edge_unmatched": score.edge_unmatched,
+        "edge_unmatched_expected": score.edge_unmatched_expected,
+        "mae_abs_nm": score.mae_abs_nm,
+        "scans": len(score.scans),
+    }
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
@@ -83,7 +99,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: phase error, and all metrics of ``metric_registry``."""
-    keys = [metric.key for metric in registered_metrics()]
+    keys = [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
     return [
         {
             "model": s.model,
@@ -118,16 +134,6 @@ def scan_table(scores: Sequence[ModelScores]) -> Rows:
 def level_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model and printed level."""
     return [{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level]
-
-
-def prediction_columns(tiles: TileConsistency | None, cost: PredictionCost) -> dict[str, float | None]:
-    """Crop dependence and cost of a model's predictions, as columns."""
-    return {
-        "tile_max_nm": tiles.max_nm if tiles else None,
-        "tile_rms_nm": tiles.rms_nm if tiles else None,
-        "prediction_s": cost.seconds_per_scan,
-        "prediction_mib": cost.peak_memory_mib,
-    }
 
 
 def interval_text(interval: Interval) -> str:
@@ -176,14 +182,6 @@ def metric_text() -> str:
     )
 
 
-def band_text() -> str:
-    """What the columns of ``band_table`` are."""
-    return (
-        "Half power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
-        "the noise band the width of the ideal low pass that lets as much white noise through; along x and y."
-    )
-
-
 def caveats(scores: Sequence[ModelScores]) -> list[str]:
     """Caveats: what was dropped, what is degenerate, what is few."""
     notes = []
@@ -194,11 +192,76 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
             notes.append(
                 f"{s.model}: {s.dropped_pixels} pixels were not measured or not valid and are not scored."
             )
-    if scores:
-        s = min(scores, key=lambda entry: entry.mae_datum_free_nm)
+    if scores and scores[0].seen_by == "afm":
+        s = min(scores, key=lambda entry: entry.leading_nm)
         notes.append(
             f"Line offsets left by {s.model}: {s.row_offset_sd_nm:.1f} nm along the rows of the layout, "
             f"{s.scan_line_offset_sd_nm:.1f} nm along the scan's own lines. Offsets that follow the layout "
             "although the scans are rotated come from the print, not from the microscope."
         )
     return notes
+
+
+# What counts as more than chance: an interval without zero, and sign flips of the independent units below.
+_CHANCE = 0.05
+_OF = {"afm": "", "sem": " of the edges"}
+
+
+def benchmark_verdict(result: Benchmark) -> str:
+    """Which model predicts best, by how much, whether that is more than chance, and what noise leaves."""
+    ranking = sorted(result.scores, key=lambda one: one.leading_nm)
+    best, *others = ranking
+    unit = "quadrants" if result.split.kind == "paper" else "scans"
+    text = (
+        f"{best.model} is best at predicting {unit} it was not trained on: {best.leading_nm:.2f} nm "
+        f"mean error{_OF[best.seen_by]} over {len(best.scans)} {unit}. "
+    )
+    if others:
+        second = others[0]
+        text += f"{second.model} is next with {second.leading_nm:.2f} nm; "
+        names = {best.model, second.model}
+        pair = next((one for one in result.paired if {one.first, one.second} == names), None)
+        text += "they were not compared scan by scan. " if pair is None else f"{chance_text(pair)}. "
+    if best.seen_by == "sem":
+        return text.rstrip()
+    return text + _share_of_noise(result.noise_floor, best.mae_datum_free_nm, result.nuisance.policy)
+
+
+def evaluation_verdict(result: Evaluation) -> str:
+    """How far the model is off on scans, what of it the zero height is, and what noise leaves."""
+    scores = result.scores
+    trained = len(result.trained_on_scored_scans)
+    seen = f" ({trained} of which it was trained on)" if trained else ""
+    if scores.seen_by == "sem":
+        of_edges = f"its edges lie {scores.leading_nm:.2f} nm from the measured ones"
+        return f"{result.model.name}: {of_edges}, mean over {len(scores.scans)} scans{seen}."
+    return (
+        f"{result.model.name} is off by {scores.mae_abs_nm:.1f} nm over {len(scores.scans)} scans{seen} as "
+        f"it stands, and by {scores.mae_datum_free_nm:.2f} nm once the scan's own terms are fitted. "
+        + _share_of_noise(result.noise_floor, scores.mae_datum_free_nm, result.nuisance.policy)
+    )
+
+
+def chance_text(pair: Paired) -> str:
+    """Whether the difference of a pair is more than chance, judged over prints where there are several."""
+    size = f"the difference is {abs(pair.mean_nm):.2f} nm"
+    over = pair.over_prints
+    if over is not None and over.smallest_p > _CHANCE:
+        return f"{size}, and {over.count} prints are too few to tell it from chance"
+    p, count, unit = (pair.p, pair.scans, "scans") if over is None else (over.p, over.count, "prints")
+    excluded = pair.ci95_nm is not None and (pair.ci95_nm[0] > 0 or pair.ci95_nm[1] < 0)
+    if p <= _CHANCE and excluded:
+        return f"{size}, more than chance (p = {p:.2g} over {count} {unit})"
+    return f"{size}, which may be chance (p = {p:.2g} over {count} {unit})"
+
+
+def _share_of_noise(floor: NoiseFloor, error_nm: float, policy: str) -> str:
+    """What of an error is noise that no model can predict."""
+    least = floor.mae_at(policy)
+    if least is None:
+        return "How much of it is noise that no model can predict is not known."
+    if floor.kind == "upper-estimate":
+        return f"Noise that no model can predict makes up {least:.2f} nm at most."
+    return (
+        f"Noise that no model can predict makes up {least:.2f} nm, so {error_nm - least:.2f} nm can be won."
+    )

@@ -8,7 +8,7 @@ are had is the problem's own business; where it may go is the problem's ``room``
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -64,6 +64,7 @@ class Rules:
         pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
         steps: at most so many; ``relative_gain``: a smaller gain of one step ends the fit.
         tries: of a step, each with ten times the damping; ``lowest_damping``: never less than this.
+        kept_above: derivatives are kept while a step gains this share of what they promise; None: never.
     """
 
     loss: Loss
@@ -73,6 +74,7 @@ class Rules:
     relative_gain: float = 5e-4
     tries: int = 4
     lowest_damping: float = 0.0
+    kept_above: float | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def fit_least_squares(
     if not len(start):
         return LeastSquaresFit(vector, linear, [])
     terms = np.zeros((len(linear), len(linear[0].basis))) if rules.loss == "absolute" else None
-    damping, losses = _DAMPING_START, []
+    damping, losses, fresh = _DAMPING_START, [], True
     for _ in shown(range(rules.steps)):
         equations = NormalEquations.at(linear, terms, rules)
         room = problem.room(vector)
@@ -100,18 +102,36 @@ def fit_least_squares(
             step, term_step = equations.solve(damping, room)
             trial = vector + step.astype(start.dtype)
             moved = None if terms is None else terms + term_step
-            loss = _total_loss(problem.residuals(trial), linear, moved, rules)
+            left = problem.residuals(trial)
+            loss = _total_loss(left, linear, moved, rules)
             if loss <= equations.loss:
                 break
             damping *= 10
         else:
-            break
+            if fresh:
+                break
+            linear, fresh = problem.linearise(vector), True
+            continue
         gained = equations.loss - loss
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
+        small = gained < rules.relative_gain * loss
+        if rules.kept_above is None:
+            holds = False
+        else:
+            holds = small or gained >= rules.kept_above * equations.promised(step)
+        if holds and (fresh or not small):
+            linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
+            if small:
+                break
+            fresh = False
+        else:
+            linear = problem.linearise(vector)
+            if small and fresh:
+                break
+            fresh = True
+    if not fresh:
         linear = problem.linearise(vector)
-        if gained < rules.relative_gain * loss:
-            break
     return LeastSquaresFit(vector, linear, losses)
 
 
@@ -170,6 +190,10 @@ class NormalEquations:
             return step, np.zeros(self.term_shape)
         terms = np.linalg.lstsq(self.matrix[count:, count:], rest, rcond=1e-14)[0]
         return step, terms[: scans * each].reshape(scans, each)
+
+    def promised(self, step: np.ndarray) -> float:
+        """What a step (p,) gains if the problem is linear, with ``squares``."""
+        return float(2 * self.right @ step - step @ self.matrix @ step)
 
     def _parameters_only(self) -> tuple[np.ndarray, np.ndarray]:
         """The equations with the terms of the scans eliminated."""

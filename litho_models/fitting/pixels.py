@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import RoundRecord
@@ -20,7 +20,7 @@ from litho_models.fitting.stochastic import learning_rate, validation_error
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
-from litho_models.scan_terms.training import PINNED, smooth_training_terms
+from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
 # Pixels of all scans together, on a square grid in each: 100 MB of features.
 FITTED_PX = 2**18

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
 from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
-from litho_models.scan_terms.training import smooth_training_terms
+from litho_models.scan_terms.policies import smooth_training_terms
 
 # Relative to the mean square of each feature, what scans may add taken out: only what the scans cannot tell
 # apart feels it. On the measured prints nothing changes from 1e-6 to 1e-4.

@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, ValidationError
 
+from litho_data.commands.progress import say
+from litho_data.commands.settings import refused
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import say
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
-from litho_data.foundation.settings import refused
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_data.store.schema import DatasetId
@@ -28,7 +28,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.background import learn_background
-from litho_models.scoring.scan_figures import baseline_of
+from litho_models.scoring.metrics import baseline_of
 from litho_models.simulator import Variant
 
 CHECKPOINT_FOLDER = "checkpoint"

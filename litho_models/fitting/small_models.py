@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Problem, Room, Rules, fit_least_squares
 from litho_models.fitting.pixel_weights import Weighted, Weights, pixel_weights
 from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
-from litho_models.scan_terms.training import PINNED, smooth_training_terms
+from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
 # A small model needs no more than a quarter of each scan: another quadrant from scan to scan.

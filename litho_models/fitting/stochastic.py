@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
@@ -30,8 +30,8 @@ from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
 from litho_models.fitting.pixel_weights import Weights, pixel_weights
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
-from litho_models.scan_terms.training import estimate_scan_terms, training_terms
-from litho_models.scoring.metrics import score_scan
+from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
+from litho_models.scoring.metrics import mean_error_nm
 from litho_models.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -254,10 +254,7 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 def validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
     """Mean datum-free error over scans, nm; None without scans."""
-    if not scans:
-        return None
-    scores = [score_scan(scan.id, scan.height_um, predict_scan(model, scan), scan.valid) for scan in scans]
-    return float(np.mean([score.mae_datum_free_nm for score in scores]))
+    return mean_error_nm(scans, (predict_scan(model, scan) for scan in scans)) if scans else None
 
 
 def _optimiser(model: Simulator, config: TrainingConfig) -> torch.optim.Optimizer:

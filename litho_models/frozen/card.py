@@ -42,6 +42,12 @@ class CardMetric(Record):
     policy: str
     background: BackgroundUse = "none"
 
+    @property
+    def text(self) -> str:
+        """The figure and its interval."""
+        between = f" ({self.ci95[0]:.2f} … {self.ci95[1]:.2f})" if self.ci95 else ""
+        return f"{self.value:.2f} {self.unit}{between}"
+
 
 class ModelCard(RunFacts, Result):
     """All that is needed to load, use and judge a frozen model.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.report_pictures import shown_html
+from litho_data.reports.pictures import shown_html
 from litho_models.frozen.card import ModelCard
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import predict_field, predict_inside

@@ -14,7 +14,6 @@ from litho_data.foundation.errors import unknown_name
 from litho_models.frozen import hub
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
-LARGEST_ZOO_BYTES = 10_000_000
 PREFIX = "zoo:"
 BEST = "best"
 _CARD_FILE = "card.json"
@@ -64,8 +63,3 @@ def _held_out_nm(folder: Path) -> float:
     """The first figure of a card: the error on held-out scans."""
     metrics = json.loads((folder / _CARD_FILE).read_text(encoding="utf-8"))["metrics"]
     return metrics[0]["value"] if metrics else float("inf")
-
-
-def size_bytes(root: str | Path = ZOO_FOLDER) -> int:
-    """What the zoo adds to the package."""
-    return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())

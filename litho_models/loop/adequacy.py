@@ -14,8 +14,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.fits import State, Study, without_terms
 from litho_models.loop.model import Placed, Twin
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL, Block, Products
 
 _BLURS_UM = (0.2, 0.6, 1.6)
 # Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.

@@ -11,7 +11,7 @@ from litho_models.loop.fits import State, Study
 from litho_models.loop.judging import judge
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, search
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and

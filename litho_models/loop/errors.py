@@ -9,7 +9,7 @@ import numpy as np
 from torch import nn
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.foundation.workers import run_jobs
+from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed, fit_with_measurement, held_out_maps
 from litho_models.loop.fits import State, Study, fit_state, prepared_among
@@ -19,7 +19,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ErrorRow, MeasuredBy, Stage, error_of
 from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.background import learn_background
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.statistics import interval

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.foundation.workers import HERE, Workers
+from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
@@ -24,16 +24,16 @@ from litho_models.fitting.least_squares import (
     solve_damped,
 )
 from litho_models.loop.folded_base import FoldedBase
-from litho_models.loop.model import Placed, Twin, finished
+from litho_models.loop.model import Placed, Twin, exposed, finished
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
-from litho_models.scan_terms.groups import Labels, groupings
+from litho_models.scan_terms.grouped import Labels, groupings
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
 # What a comparison of errors leaves to the single scans.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
-RULES = Rules("squares")
+RULES = Rules("squares", steps=24, kept_above=0.8)
 # The way to the neighbourhood of the optimum is walked on every third scan.
 _START_EVERY = 3
 # A fit without a fold starts at the common one and takes its derivatives.
@@ -154,7 +154,8 @@ class TwinProblem:
     ) -> Linearised:
         twin, own = placed.twin, placed.twin.own
         chain = placed.chain(window)
-        base = placed.base_height(chain, window, self._fold)
+        layout = exposed(chain, window)
+        base = placed.height_of(layout, window, self._fold)
         prediction = finished(chain, base, window)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
@@ -163,9 +164,13 @@ class TwinProblem:
             if slot is not None and not twin.is_of(slot, window):
                 continue
             there = other.chain(window)
-            # What acts on the height leaves the height of the base, most of the work, as it is.
-            same = slot is not None and get_effect(slot.effect).acts_on == "height"
-            height = base if same else other.base_height(there, window, self._fold)
+            # Only what is before a number in the chain stays as it is.
+            if slot is None:
+                height = other.height_of(layout, window, self._fold)
+            elif get_effect(slot.effect).acts_on == "height":
+                height = base
+            else:
+                height = other.base_height(there, window, self._fold)
             rows[i] = (window.at_sample(finished(there, height, window)) - value) / step
         basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
         return Linearised(window.height - value, rows, basis)
@@ -245,14 +250,16 @@ def _without(
         linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(_FOLD_STEPS):
-        here = common.at(vector)
-        trial = vector + solve_damped(normal, right, _FOLD_DAMPING, here.room())
+        step = solve_damped(normal, right, _FOLD_DAMPING, common.at(vector).room())
+        trial = vector + step
+        # So small a step is what the derivatives say.
+        if 2 * right @ step - step @ normal @ step <= _FOLD_GAIN * total:
+            vector = trial
+            break
         left = TwinProblem(common, windows, fold).residuals(trial)
         moved = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
         _, right, squares = eliminated_sum(moved, RULES.term_weight)
         if squares > total:
             break
-        vector, gained, total = trial, total - squares, squares
-        if gained <= _FOLD_GAIN * squares:
-            break
+        vector, total = trial, squares
     return common.at(vector).known_from(windows).vector

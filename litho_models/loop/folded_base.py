@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from torch import nn
 
-from litho_data.foundation.commands import progress
-from litho_data.foundation.workers import HERE, Workers, run_jobs
+from litho_data.commands.progress import progress
+from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 
 # Where other processes train, it is sent to them.

@@ -10,6 +10,8 @@ from litho_models.loop.fits import Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
+# Every candidate and law is tried by every grouping: one in a hundred exchanges may do as well.
+EXCHANGED_P = 0.01
 # By chance alone seven gains out of seven come once in 128: below eight scans nothing is confirmed.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8

@@ -21,8 +21,7 @@ from litho_models.loop.fits import ALL_FREE, Study
 from litho_models.loop.judging import SMALLEST_SHARE
 from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
 # All rows of all scans; with more scans each is thinned.

@@ -16,7 +16,7 @@ from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.groups import ALL, label_of
+from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = dict[str, dict[str, float]]
@@ -277,16 +277,26 @@ class Placed:
 
     def base_height(self, chain: EffectChain, scan: PreparedScan, fold: int | None = None) -> Tensor:
         """Height (1, 1, y, x), µm, of the base on the layout with the effects that act on it."""
+        return self.height_of(exposed(chain, scan), scan, fold)
+
+    def height_of(self, exposed_um: Tensor, scan: PreparedScan, fold: int | None = None) -> Tensor:
+        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
         base = self.base
         if isinstance(base, FoldedBase):
             base = base.of_scan(scan.id) if fold is None else base.of_fold(fold)
         with torch.no_grad():
-            return base(chain.before_base(scan.layout, scan.context))
+            return base(exposed_um)
 
     def height(self, scan: PreparedScan, fold: int | None = None) -> np.ndarray:
         """Predicted height of the print (y, x), µm."""
         chain = self.chain(scan)
         return finished(chain, self.base_height(chain, scan, fold), scan)
+
+
+def exposed(chain: EffectChain, scan: PreparedScan) -> Tensor:
+    """The layout (1, 1, y, x), µm, with the effects that act on it."""
+    with torch.no_grad():
+        return chain.before_base(scan.layout, scan.context)
 
 
 def finished(chain: EffectChain, base_height: Tensor, scan: PreparedScan) -> np.ndarray:

@@ -13,6 +13,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
+from litho_models.scan_terms.blocks import thinned
 
 # Fits and screening keep away from the edge: pixels nearer to it see a neighbourhood that the layout does not
 # hold. Errors are scored on all pixels, as in the benchmark (``Blocks.border_px``).
@@ -169,9 +170,6 @@ def _inner(shape: tuple[int, int]) -> np.ndarray:
 def _thinned(
     scan: PrintedScan, context: FieldContext, usable: np.ndarray, sampled: np.ndarray, line: LineIndex
 ) -> PreparedScan:
-    stride = max(1, round((sampled.sum() / SAMPLE_PX) ** 0.5))
-    lattice = np.zeros_like(sampled)
-    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    sample = np.flatnonzero(sampled & lattice)
+    sample = thinned(sampled, SAMPLE_PX)
     height = scan.height_um.reshape(-1)[sample].astype(np.float64)
     return PreparedScan(scan, context.layout_um, context, usable, sample, height, line)

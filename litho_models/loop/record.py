@@ -13,7 +13,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy
-from litho_models.scoring.pairs import OverUnits
+from litho_models.scoring.statistics import OverUnits
 from litho_models.splits.folds import Split
 
 Verdict = Literal["traced", "described", "nothing-missing", "unexplained", "too-few-scans"]

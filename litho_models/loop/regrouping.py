@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from litho_models.loop.fits import State, Study, without_terms
-from litho_models.loop.judging import FAMILY_P
+from litho_models.loop.judging import EXCHANGED_P
 from litho_models.loop.model import Twin
 from litho_models.loop.screening import gains_by, permutation_p
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, Labels
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 
 # Of groupings that do nearly as well the one with the fewest labels is taken.
 NEARLY = 0.95
@@ -43,8 +42,8 @@ def regrouped(state: State, name: str, study: Study) -> tuple[str, float, Twin] 
         return None
     close = [by for by, gain in by_group.items() if gain >= NEARLY * most]
     best = min(close, key=lambda by: (len(set(study.groups[by])), -by_group[by]))
-    p = permutation_p(study, by_group[best], gains)
-    if p > FAMILY_P:
+    p = permutation_p(study, study.groups[best], by_group[best], gains)
+    if p > EXCHANGED_P:
         return None
     steps = gains_by(freed, study.fold_of, columns, study.groups[best])[1]
     return best, p, _started(twin, name, best, dict(zip(amplitudes, _by_number(steps), strict=True)))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
-from litho_models.loop.record import CloseLoop, Decision, ErrorRow, FoundEffect, Planted, ScanFinding
-from litho_models.scan_terms.groups import ALL
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
+from litho_models.loop.record import CloseLoop, Decision, ErrorRow, FoundEffect, ScanFinding
+from litho_models.scan_terms.grouped import ALL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,6 +24,10 @@ _STAGES = {
     "all": "corrected",
 }
 _SHOWN_SCANS = 3
+_OF_EFFECT = (
+    *("name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm", "family_p"),
+    "confusable_with",
+)
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
@@ -43,7 +47,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     if result.effects:
         page.heading("What was found")
         page.points([effect_text(one) for one in result.effects])
-        page.table([_effect_row(one) for one in result.effects], "What was added.", "effects.csv")
+        page.table(result.effects, "What was added.", "effects.csv", columns=_OF_EFFECT)
         page.table(
             [row for one in result.effects for row in _strength_rows(one)],
             "Strengths with 95 % intervals, by what each print (or scan) asks for.",
@@ -56,7 +60,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     page.heading("Where the residual lies")
     page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
     page.table(
-        [one.model_dump() for one in result.explained],
+        result.explained,
         "What a ridge over features of layout and place still explains, out of fold.",
         "explained.csv",
     )
@@ -76,11 +80,11 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     )
     if result.planted:
         page.heading("What was planted in copies of the scans")
-        page.table([_planted_row(one) for one in result.planted], "Is it named?", "planted.csv", digits=3)
+        page.table(result.planted, "Is it named?", "planted.csv", digits=3)
     if result.confounded:
         page.paragraph(f"Known together only: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}.")
     page.heading("Every other candidate", folded=True)
-    page.table([one.model_dump() for one in result.candidates], "Why it was not added.", "candidates.csv")
+    page.table(result.candidates, "Why it was not added.", "candidates.csv")
     return page.write(folder)
 
 
@@ -191,19 +195,9 @@ def _residuals(maps: Maps) -> Figure:
     return figure
 
 
-def _effect_row(one: FoundEffect) -> dict[str, object]:
-    kept = {"name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm", "family_p"}
-    return {**one.model_dump(include=kept), "confusable_with": ", ".join(one.confusable_with)}
-
-
 def _scan_row(one: ScanFinding) -> dict[str, object]:
     spread = (f"{name} {own.value:.3g} {own.unit}" for name, own in one.spread.items())
-    alike = ", ".join(one.confusable_with)
-    return {**one.model_dump(), "spread": ", ".join(spread), "confusable_with": alike}
-
-
-def _planted_row(one: Planted) -> dict[str, object]:
-    return {**one.model_dump(), "named": ", ".join(one.named) or "no"}
+    return {**one.model_dump(), "spread": ", ".join(spread)}
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:

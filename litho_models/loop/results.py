@@ -29,8 +29,8 @@ from litho_models.loop.record import (
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
-from litho_models.scan_terms.groups import ALL
-from litho_models.scoring.pairs import over_prints, over_scans
+from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
 
 _BASE_ABSORBS = 1e-2
@@ -68,7 +68,7 @@ def record(
         groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
         errors=errors,
         gain_nm=float(np.mean(gains)),
-        over_scans=over_scans(gains, study.seed),
+        over_scans=over_units(gains, seed=study.seed),
         over_prints=over_prints(gains, prints, study.seed),
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),

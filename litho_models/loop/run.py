@@ -10,12 +10,11 @@ from typing import Literal
 import numpy as np
 from torch import nn
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.workers import Workers, kept_open
+from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.loop.bases import AUTO, choose_base
 from litho_models.loop.closing import Closed, close, fit_with_measurement
@@ -32,6 +31,7 @@ from litho_models.loop.single_scans import SingleScans
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
+_HOLDS = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
 _FEWEST_PIXELS = 1024
 Nested = Literal["folds", "prints"]
 # What is made of a closed loop before it is written: its record, and records to be written beside it.
@@ -53,6 +53,7 @@ def close_loop(
     workers: int = 1,
     dask: str | None = None,
     further: Further | None = None,
+    decided_by: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
@@ -68,20 +69,25 @@ def close_loop(
         cache: folder where such trainings are kept and continued, by default beside ``out``.
         seed: of folds, calibration blocks and permutations.
         workers: local processes; ``dask``: address of a Dask scheduler instead.
-        further: called before anything is written.
+        further: called before anything is written; ``decided_by``: hashes of the stores that it asks.
         report: told what happens, a sentence at a time.
 
     Raises:
         InputError: no store, an unknown base, too few usable scans, or a nested selection of a base that is
             not fitted here.
     """
-    require_replaceable_folder(
-        out, CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE
-    )
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
     development, locked, dropped = _usable_scans(opened)
-    with kept_open(Workers(workers, dask)) as places:
+    settings = {
+        "base": base, "folds": folds, "nested": nested, "inject": list(inject), "steps": steps,
+        "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
+    }  # fmt: skip
+    facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
+    with (
+        whole_folder(out, *_HOLDS, record=CloseLoop.FILE_NAME, facts=facts) as folder,
+        kept_open(Workers(workers, dask)) as places,
+    ):
         study = Study((), dealt(development, folds, seed), seed, places, report)
         chosen = choose_base(base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"))
         if nested and not is_refitted(chosen.model):
@@ -103,29 +109,26 @@ def close_loop(
                     locked, maps, model=stage, measurement="shared", held_out="locked", numbers=fit.numbers,
                     seed=seed,
                 )  # fmt: skip
-    report("looking at what single scans add")
-    maps = held_out.maps_um(closed.final)
-    seen = marks(closed.original, maps, _rounding_um(opened, development))
-    result = record(
-        closed,
-        errors,
-        single_scans=with_marks(SingleScans(study, closed.original, maps).findings(), seen),
-        left_out_nm=left_out_nm,
-        survives_on=survives_on,
-        run=run_info([seed], len(development), dropped),
-        dataset=opened.dataset_id,
-        base_model=chosen.name,
-        measurement=fit_with_measurement(closed.final.twin, closed.original, seed)[1],
-        planted=planted,
-        settings={
-            "base": base, "folds": folds, "nested": nested, "inject": list(inject), "steps": steps,
-            "open_lock_box": open_lock_box,
-        },
-        split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
-        chosen=often,
-    )  # fmt: skip
-    result, beside = further(closed, result) if further else (result, ())
-    with atomic_folder(out) as folder:
+
+        report("looking at what single scans add")
+        maps = held_out.maps_um(closed.final)
+        seen = marks(closed.original, maps, _rounding_um(opened, development))
+        result = record(
+            closed,
+            errors,
+            single_scans=with_marks(SingleScans(study, closed.original, maps).findings(), seen),
+            left_out_nm=left_out_nm,
+            survives_on=survives_on,
+            run=run_info([seed], len(development), dropped),
+            dataset=opened.dataset_id,
+            base_model=chosen.name,
+            measurement=fit_with_measurement(closed.final.twin, closed.original, seed)[1],
+            planted=planted,
+            settings=settings,
+            split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
+            chosen=often,
+        )  # fmt: skip
+        result, beside = further(closed, result) if further else (result, ())
         for written in (result, *beside):
             written.write(folder)
         write_report(result, held_out.residuals(), folder)

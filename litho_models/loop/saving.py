@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from litho_data.reports.page import filled
 from litho_data.store import Store
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.closing import Closed
 from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.model import Values
 from litho_models.loop.record import CloseLoop
 from litho_models.simulator import Simulator
 
@@ -21,22 +23,8 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
     laws = [one for one in result.effects if one.knowledge == "law"]
     if not laws:
         return
-    lines = [
-        f'"""Laws found on {result.dataset.name}: import this to screen, fit and apply them by name."""',
-        "",
-        "from dataclasses import replace",
-        "",
-        "from litho_models.effects import register_effect",
-        "from litho_models.effects.laws import LAWS",
-    ]
-    for one in laws:
-        sizes = ", ".join(f"{own.value:.4g} {own.unit}" for own in one.strengths["strength"])
-        lines += [
-            "",
-            f"# {one.title}; strength {sizes}",
-            f"register_effect(replace(LAWS[{one.name!r}], name='law-{one.name}', knowledge='cause'))",
-        ]
-    (folder / LAWS_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = filled(Path(__file__).with_name(f"{LAWS_FILE}.jinja"), result=result, laws=laws)
+    (folder / LAWS_FILE).write_text(text, encoding="utf-8")
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
@@ -49,18 +37,18 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
     values = twin.values(twin.labels(latest))
     sides = {"process": "printer", "measurement": "microscope"}
-    role = {one.name: one.role for one in result.effects}
+    by_side: dict[str, Values] = {f"{side}_effects": {} for side in (*sides, "undetermined")}
+    for one in result.effects:
+        if one.name in values:
+            side = one.role if one.role in sides else "undetermined"
+            by_side[f"{side}_effects"][one.name] = values[one.name]
     error = result.error("all")
     assert error is not None
     save_frozen(
         base,
         folder,
         name=f"{result.base_model}, loop findings",
-        process_effects={name: own for name, own in values.items() if role[name] == "process"},
-        measurement_effects={name: own for name, own in values.items() if role[name] == "measurement"},
-        undetermined_effects={
-            name: own for name, own in values.items() if role[name] not in ("process", "measurement")
-        },
+        **by_side,
         dataset=result.dataset.model_dump(mode="json"),
         attributed={
             one.name: sides[one.role]

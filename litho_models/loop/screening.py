@@ -19,8 +19,7 @@ from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.loop.fits import ALL_FREE, State, Study
 from litho_models.loop.model import Twin, finished
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, Labels
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
 # Of a direction's information, what must survive the projections for a test to mean anything.
@@ -251,7 +250,10 @@ class Screening:
 
     def permutation_p(self, one: Screened) -> float:
         """See ``permutation_p``."""
-        return permutation_p(self.study, one.gain_nm2, lambda by: self._gains(one.trial, one.columns, by)[0])
+        labels = self.study.groups[one.by]
+        return permutation_p(
+            self.study, labels, one.gain_nm2, lambda by: self._gains(one.trial, one.columns, by)[0]
+        )
 
     def family_p(self, one: Screened) -> float:
         """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
@@ -314,16 +316,29 @@ def gains_by(
     return gains * NM_PER_UM**2, multiples
 
 
-def permutation_p(study: Study, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
-    """Share of exchanges of the scans after which a strength by any grouping gains as much as this."""
-    groupings = [np.array(labels) for by, labels in study.groups.items() if by != ALL]
-    rng = np.random.default_rng(study.seed)
-    beaten = 0
+def permutation_p(
+    study: Study, labels: Labels, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]
+) -> float:
+    """Share of exchanges of the scans after which a strength by any grouping gains as much as by ``labels``.
+
+    An exchange that leaves every scan beside the same others changes nothing, and is not counted.
+    """
+    groupings = [np.array(own) for by, own in study.groups.items() if by != ALL]
+    rng, judged = np.random.default_rng(study.seed), _beside(np.array(labels))
+    exchanged = beaten = 0
     for _ in range(PERMUTATIONS):
         order = rng.permutation(len(study.scans))
-        gains = (gains_of(tuple(own[order])) for own in groupings)
-        beaten += any(own.mean() >= gain_nm2 * (1 - 1e-12) for own in gains)
-    return (1 + beaten) / (1 + PERMUTATIONS)
+        moved = [own[order] for own in groupings]
+        if any((_beside(own) == judged).all() for own in moved):
+            continue
+        exchanged += 1
+        beaten += any(gains_of(tuple(own)).mean() >= gain_nm2 * (1 - 1e-12) for own in moved)
+    return (1 + beaten) / (1 + exchanged)
+
+
+def _beside(labels: np.ndarray) -> np.ndarray:
+    """Which scans (n, n) share a label."""
+    return labels[:, None] == labels[None, :]
 
 
 def _solved(info: np.ndarray, score: np.ndarray) -> np.ndarray:

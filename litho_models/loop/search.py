@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from litho_data.foundation.workers import run_jobs
+from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import FAMILY_P, GROUPED_P, Judgement, judge, told_apart
+from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart
 from litho_models.loop.regrouping import NEARLY, regrouped
 from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening, Secants
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 
 MOST_EFFECTS = 8
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
@@ -218,7 +218,7 @@ def _grouped(
     # Of groupings that do nearly as well the one with the fewest numbers.
     close = [one for one in better if one.gain_nm2 >= NEARLY * best.gain_nm2]
     best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
-    return best if screening.permutation_p(best) <= FAMILY_P else None
+    return best if screening.permutation_p(best) <= EXCHANGED_P else None
 
 
 def _fitted(state: State, entering: Sequence[Screened], study: Study) -> dict[str, State]:

@@ -7,21 +7,37 @@ from typing import Any
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
+from litho_models.models.electron_beam import ElectronBeam
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
 from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
 from litho_models.simulator import Simulator, Variant
 
-__all__ = ["MODELS", "build_model", "model_class", "require_models"]
+__all__ = ["MODELS", "build_model", "model_class", "register_simulator", "require_models"]
 
 MODELS: dict[str, type[Simulator]] = {
     model.name: model
     for model in (
         *(Identity, Affine, AffineMtf, BlurTable, Linear),
-        *(Features, RandomFeatures, Physics, Pbl, Fno),
+        *(Features, RandomFeatures, Physics, ElectronBeam, Pbl, Fno),
     )
 }
+
+
+def register_simulator(model: type[Simulator]) -> type[Simulator]:
+    """Take a model by its name from now on, in every function and command of this process.
+
+    For work in several processes, put the call in a module that each of them imports.
+
+    Raises:
+        InputError: no name of its own, or one that is taken.
+    """
+    name = getattr(model, "name", "")
+    if not name or name in MODELS:
+        raise InputError("simulator to register", got=f"name {name!r}", wanted="a name that is not taken")
+    MODELS[name] = model
+    return model
 
 
 def model_class(name: str) -> type[Simulator]:

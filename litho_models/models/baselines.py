@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
-from litho_models.layers.lookup import interpolate
+from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
@@ -45,6 +47,8 @@ class Affine(Simulator):
 
 
 class BlurTableConfig(SimulatorConfig):
+    LENGTHS: ClassVar[tuple[str, ...]] = ("sigma_max_um", "sigma_init_um")
+
     sigma_max_um: float = Field(1.0, gt=0, description="upper bound of the blur, µm")
     sigma_init_um: float = Field(0.25, gt=0, description="blur before fitting, µm")
 
@@ -80,6 +84,8 @@ class BlurTable(Simulator):
 
 
 class AffineMtfConfig(SimulatorConfig):
+    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um",)
+
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8), min_length=1)
 
 
@@ -125,6 +131,8 @@ def blurred_interior(
 
 
 class LinearConfig(SimulatorConfig):
+    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um", "power_sigma_um")
+
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0), min_length=1)
     power_sigma_um: float = 0.25
     power_reference_um: float = 0.5

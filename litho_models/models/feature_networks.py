@@ -32,6 +32,7 @@ class FeatureNetworkConfig(BaseModel):
     """Which features, all lengths in µm, and how many hidden units see them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    LENGTHS: ClassVar[tuple[str, ...]] = ("blurs_um", "slope_blurs_um", "shifts_um", "steep_um")
 
     hidden: tuple[int, ...] = Field((48, 32), min_length=1, max_length=8, description="hidden units")
     blurs_um: Widths = Field((0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5), description="σ")

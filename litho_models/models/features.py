@@ -21,6 +21,11 @@ _UNITS_AT_ONCE = 64
 
 
 class FeaturesConfig(SimulatorConfig):
+    LENGTHS: ClassVar[tuple[str, ...]] = (
+        *("sigmas_um", "slope_sigmas_um", "shifts_um", "shift_sigma_um"),
+        *("streak_sigmas_um", "steep_sigmas_um", "steep_widths_um"),
+    )
+
     sigmas_um: tuple[float, ...] = Field(
         (0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5, 4.0),
         min_length=1,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
-from litho_models.layers.lookup import PointwiseNet
+from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
     FeatureNetwork,
@@ -26,12 +26,18 @@ from litho_models.models.feature_networks import (
     ScanAxisConfig,
     Surroundings,
 )
-from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+from litho_models.simulator import Simulator, SimulatorConfig, Variant, crop_border, scaled_lengths
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
 
 
 class PblConfig(SimulatorConfig):
+    LENGTHS: ClassVar[tuple[str, ...]] = (
+        "sigma_optical_um",
+        "sigma_diffusion_max_um",
+        "sigma_diffusion_init_um",
+    )
+
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
     # Wider than the areawise network sees (0.5 µm): what it starts with is what it alone can learn.
@@ -70,6 +76,18 @@ class PblConfig(SimulatorConfig):
             "blur_modulus": True,
         },
     }
+
+    @classmethod
+    def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
+        """As of every model; the networks of features have lengths of their own."""
+        config = super().of_variant(variant, **fields)
+        parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
+        scaled = {
+            name: part.model_copy(update=scaled_lengths(type(part), {}, config.pitch_um))
+            for name, part in parts.items()
+            if part is not None and not fields.get(name)
+        }
+        return config.model_copy(update=scaled)
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:

@@ -23,6 +23,7 @@ from litho_models.layers.gaussian import (
     supported_radius_px,
 )
 from litho_models.layers.ranges import Range
+from litho_models.models.parts import project
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]
@@ -31,6 +32,11 @@ Spot = Literal["given", "round", "elliptical"]
 
 class PhysicsConfig(SimulatorConfig):
     """The bare defaults are the form of models frozen before there was a gain; variants set the others."""
+
+    LENGTHS: ClassVar[tuple[str, ...]] = (
+        *("sigma_optical_um", "sigma_optical_max_um"),
+        *("sigma_diffusion_max_um", "sigma_diffusion_init_um"),
+    )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one an axis")
@@ -179,9 +185,7 @@ class Physics(Simulator):
         return optical, diffused
 
     def _project(self, aerial: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        alpha, eta = values["alpha"], values["eta"]
-        low = torch.tanh(alpha * eta)
-        return (low + torch.tanh(alpha * (aerial - eta))) / (low + torch.tanh(alpha * (1 - eta)))
+        return project(aerial, values["alpha"], values["eta"])
 
     def _develop(self, initial: Tensor, dose: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         if self.config.shrinkage == "image-range":

@@ -1,6 +1,6 @@
 """Whether a printer still behaves as its frozen model says."""
 
 from litho_models.monitoring.check import check
-from litho_models.monitoring.result import Check
+from litho_models.monitoring.prints import Check
 
 __all__ = ["Check", "check"]

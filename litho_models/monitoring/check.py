@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.commands.progress import say
 from litho_data.foundation.begun import growing_folder
-from litho_data.foundation.commands import say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import Store, open_store
@@ -15,9 +15,8 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.monitoring import wording
 from litho_models.monitoring.inputs import gather
 from litho_models.monitoring.judging import DEFAULT_RATE, judge
-from litho_models.monitoring.prints import FIGURES
+from litho_models.monitoring.prints import FIGURES, Check, CheckedModel
 from litho_models.monitoring.report import write_check_report
-from litho_models.monitoring.result import Check, CheckedModel
 
 
 def check(

@@ -10,13 +10,11 @@ from scipy.stats import t as student
 
 from litho_models.monitoring.change_point import (
     Series,
-    Step,
     likeliest_step,
     noticeable_step,
 )
-from litho_models.monitoring.prints import FIGURES, Figure, print_values, spread_of
-from litho_models.monitoring.result import Alarm, FigureCheck
-from litho_models.scoring.scan_figures import ScanFigures
+from litho_models.monitoring.prints import FIGURES, Alarm, Figure, FigureCheck, print_values, spread_of
+from litho_models.scoring.metrics import ScanFigures
 
 
 class Trend(NamedTuple):
@@ -97,28 +95,6 @@ def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
     return [rate * figure.weight / total for figure in figures]
 
 
-def alarms(
-    reference: Sequence[ScanFigures], new: Sequence[ScanFigures], *, rate: float = DEFAULT_RATE
-) -> list[str]:
-    """The figures that raise an alarm, as ``judge`` finds them, and nothing else."""
-    return [
-        figure.name
-        for figure, own in zip(FIGURES, rates(rate), strict=True)
-        if _found(figure, reference, new)[1] <= own
-    ]
-
-
-def _found(
-    figure: Figure, reference: Sequence[ScanFigures], new: Sequence[ScanFigures]
-) -> tuple[Step, float, Series]:
-    """The likeliest step, its p, and the figures that it was found in."""
-    spread = spread_of(reference, figure)
-    old, now = print_values(reference, figure), print_values(new, figure)
-    variances = [spread.relative_variance(part.counts) for part in (old, now)]
-    series = Series(old.values, now.values, variances[0], variances[1])
-    return *likeliest_step(series), series
-
-
 def _judged(
     figure: Figure,
     reference: Sequence[ScanFigures],
@@ -130,8 +106,8 @@ def _judged(
 ) -> FigureCheck:
     old, now = print_values(reference, figure), print_values(new, figure)
     spread = spread_of(reference, figure)
-    step, p, series = _found(figure, reference, new)
-    variances = series.reference_variance, series.new_variance
+    variances = spread.relative_variance(old.counts), spread.relative_variance(now.counts)
+    step, p = likeliest_step(Series(old.values, now.values, *variances))
     noticeable = spread.sd * noticeable_step(*variances, rate)
     allowed = tolerance if tolerance is not None else TOLERANCE_SPREADS * spread.sd
     values, variance = np.concatenate([old.values, now.values]), np.concatenate(variances)

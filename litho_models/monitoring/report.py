@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
-from litho_models.monitoring.prints import print_values
-from litho_models.monitoring.result import Check, FigureCheck
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import new_figure
+from litho_models.monitoring.prints import Check, FigureCheck, print_values
 from litho_models.monitoring.wording import figure_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_COLUMNS = (
+    *("name", "mean", "spread", "p", "alarm_at", "alarm_since", "alarm_step", "noticeable_step", "trend"),
+    *("trend_ci95", "measure_again_in"),
+)
 
 
 def write_check_report(result: Check, out: str | Path) -> Path:
@@ -28,13 +32,19 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.note(*result.notes)
     page.heading("In numbers", folded=True)
     page.table(
-        _figures_table(result),
+        result.figures,
         "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed, whichever print "
         f"is the first; an alarm at alarm_at or less, the figure's share of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
+        columns=_COLUMNS,
     )
-    page.table(_scans_table(result), f"Every scan; reference: {result.reference}.", "scans.csv", digits=4)
+    scans = [
+        {"set": name, **row.model_dump()}
+        for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
+        for row in rows
+    ]
+    page.table(scans, f"Every scan; reference: {result.reference}.", "scans.csv", digits=4)
     return page.write(out)
 
 
@@ -84,34 +94,3 @@ def _chart_text(one: FigureCheck) -> str:
         f"Large dots are prints, small ones their scans. 0 is the mean of {one.reference_prints} reference "
         f"prints, {one.mean:.4g}{unit}; dashed: the tolerance, {100 * one.tolerance:.1f} %."
     )
-
-
-def _figures_table(result: Check) -> list[dict[str, Any]]:
-    rows = []
-    for one in result.figures:
-        alarm = one.alarm
-        rows.append(
-            {
-                "figure": one.name,
-                "reference_mean": one.mean,
-                "spread": one.spread,
-                "p": f"{one.p:.2g}",
-                "alarm_at": f"{one.alarm_at:.2g}",
-                "since": alarm.since if alarm else "–",
-                "step": alarm.step if alarm else float("nan"),
-                "noticeable_step": np.nan if one.noticeable_step is None else one.noticeable_step,
-                "trend_per_print": one.trend,
-                "trend_low": one.trend_ci95[0],
-                "trend_high": one.trend_ci95[1],
-                "measure_again_in": one.measure_again_in,
-            }
-        )
-    return rows
-
-
-def _scans_table(result: Check) -> list[dict[str, Any]]:
-    return [
-        {"set": name, **row.model_dump()}
-        for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
-        for row in rows
-    ]

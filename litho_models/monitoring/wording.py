@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.report import capitalised
+from litho_data.reports.page import capitalised
 from litho_models.monitoring.change_point import SOON
-from litho_models.monitoring.prints import FIGURES, Figure, in_order
-from litho_models.monitoring.result import FigureCheck
+from litho_models.monitoring.prints import FIGURES, Figure, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
-from litho_models.scoring.scan_figures import ScanFigures
+from litho_models.scoring.metrics import ScanFigures
 
 # A layout this much flatter, higher or steeper than every one of the reference is of another kind.
 _OTHER_KIND = 1.1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
@@ -51,37 +51,39 @@ def analyse_noise(
     if model is not None and not residuals:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
-    require_own_folder(out, NoiseAnalysis.FILE_NAME, subject={"dataset.name": dataset.name})
-    every = dataset.scans()
-    locked = dataset.locked_ids
-    scans = [scan for scan in every if scan.id not in locked]
-    references = store_references(dataset)
-    spread = read_residuals(dataset, residuals, model) if residuals else None
-    found = reference_prints(references, dataset.level_height_um)
-    dose, notes = dose_matrix(every)
-    # A dose often has one print, without which it is lost, and no model is judged by the matrix.
-    in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
-    if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
-        notes.append(f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}.")
-    dropped = [
-        f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
-        for scan_id in locked
-    ]
-    repeats = repeated_prints(scans)
-    budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
-    result = NoiseAnalysis(
-        run=run_info([seed], len(scans), dropped),
-        dataset=dataset.dataset_id,
-        noise_floor=floor_of(found, repeats, budget),
-        references=found,
-        repeats=repeats,
-        dose=dose,
-        budget=budget,
-        spread=analyse_spread(spread, seed) if spread is not None else None,
-        notes=[*_notes(found, repeats, budget), *notes],
-    )
-    result.write(out)
-    write_noise_report(result, references, out)
+    with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
+        every = dataset.scans()
+        locked = dataset.locked_ids
+        scans = [scan for scan in every if scan.id not in locked]
+        references = store_references(dataset)
+        spread = read_residuals(dataset, residuals, model) if residuals else None
+        found = reference_prints(references, dataset.level_height_um)
+        dose, notes = dose_matrix(every)
+        # A dose often has one print, without which it is lost, and no model is judged by the matrix.
+        in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
+        if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
+            notes.append(
+                f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}."
+            )
+        dropped = [
+            f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
+            for scan_id in locked
+        ]
+        repeats = repeated_prints(scans)
+        budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
+        result = NoiseAnalysis(
+            run=run_info([seed], len(scans), dropped),
+            dataset=dataset.dataset_id,
+            noise_floor=floor_of(found, repeats, budget),
+            references=found,
+            repeats=repeats,
+            dose=dose,
+            budget=budget,
+            spread=analyse_spread(spread, seed) if spread is not None else None,
+            notes=[*_notes(found, repeats, budget), *notes],
+        )
+        write_noise_report(result, references, out)
+        result.write(out)
     return result
 
 
@@ -106,24 +108,26 @@ def analyse_noise_of_files(
     Raises:
         InputError: a file that cannot be read, or without a known pitch.
     """
-    require_own_folder(out, NoiseAnalysis.FILE_NAME)
-    references = []
-    for use, file in (("substrate", substrate), ("flat", flat), ("steps", steps)):
-        if file is not None:
-            scan = read_scan(file, unit=unit, size_um=size_um)
-            references.append(Reference(Path(file).stem, use, scan.height_um, scan.require_pitch()))
-    found = reference_prints(references, level_height_um)
-    result = NoiseAnalysis(
-        run=run_info([], len(references)),
-        dataset=None,
-        noise_floor=floor_of(found, None, None),
-        references=found,
-        dose=None,
-        spread=None,
-        notes=["Single scans as read: levelling is an offset or a polynomial of second degree, as stated."],
-    )
-    result.write(out)
-    write_noise_report(result, references, out)
+    with growing_folder(out, NoiseAnalysis.FILE_NAME):
+        references = []
+        for use, file in (("substrate", substrate), ("flat", flat), ("steps", steps)):
+            if file is not None:
+                scan = read_scan(file, unit=unit, size_um=size_um)
+                references.append(Reference(Path(file).stem, use, scan.height_um, scan.require_pitch()))
+        found = reference_prints(references, level_height_um)
+        result = NoiseAnalysis(
+            run=run_info([], len(references)),
+            dataset=None,
+            noise_floor=floor_of(found, None, None),
+            references=found,
+            dose=None,
+            spread=None,
+            notes=[
+                "Single scans as read: levelling is an offset or a polynomial of second degree, as stated."
+            ],
+        )
+        write_noise_report(result, references, out)
+        result.write(out)
     return result
 
 

@@ -59,11 +59,10 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
     level, left, number = [], [], []
-    lines_out = freed["full+rows"][1]
-    for at, (scan, residual_um, slope) in enumerate(zip(found.scans, lines_out, slopes, strict=True)):
-        flat = np.isfinite(residual_um) & (slope <= limit)
+    for at, (scan, fit, slope) in enumerate(zip(found.scans, freed["full+rows"], slopes, strict=True)):
+        flat = np.isfinite(fit.residual_um) & (slope <= limit)
         level.append(scan.mask_level[flat])
-        left.append(NM_PER_UM * residual_um[flat])
+        left.append(NM_PER_UM * fit.residual_um[flat])
         number.append(np.full(np.count_nonzero(flat), at))
     levels, residuals, owner = (np.concatenate(part) for part in (level, left, number))
     squares, sizes = residuals**2, np.abs(residuals)
@@ -83,8 +82,8 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
                 mae_nm=float(sizes[mine].mean()),
             )
         )
-    lines_in = zip(freed["full"][1], slopes, strict=True)
-    flats = [np.where(slope <= limit, residual_um, np.nan) for residual_um, slope in lines_in]
+    lines_in = zip(freed["full"], slopes, strict=True)
+    flats = [np.where(slope <= limit, fit.residual_um, np.nan) for fit, slope in lines_in]
     pitch_um = found.scans[0].pitch_um
     small = min(min(flat.shape) for flat in flats) < FEWEST_LINES
     return NoiseBudget(

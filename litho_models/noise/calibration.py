@@ -40,6 +40,7 @@ _BINS = 8
 _GROUP_LEVELS = (0.68, 0.95)
 # Share of scans that the scan-level factor promises to hold; it takes nine scans to promise 90 %.
 CONFORMAL_LEVEL = 0.9
+_MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
 class ScanCalibration(Record):
@@ -153,8 +154,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     prints = [scan.print_id for scan in scans]
     by_print = len(set(prints)) > 2
     fold = np.unique(prints, return_inverse=True)[1] if by_print else np.arange(len(scans)) % _FOLDS
-    constant: dict[int, Stated] = {}
-    by_covariates: dict[int, Stated] = {}
+    constant, by_covariates = ([Stated(np.empty(0), GAUSSIAN)] * len(scans) for _ in range(2))
     for number in np.unique(fold):
         learned = np.flatnonzero(fold != number)
         residual = np.concatenate([samples[i] for i in learned])
@@ -163,18 +163,13 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
         for i in np.flatnonzero(fold == number).tolist():
             constant[i] = Stated(np.full(scans[i].shape, flat), GAUSSIAN)
             by_covariates[i] = Stated(scale_nm(beta, covariates_of(places[i])), tails)
-    stated = [by_covariates[i] for i in range(len(scans))]
-    calibrations = [
-        calibrate("constant", scans, residuals, [constant[i] for i in range(len(scans))]),
-        calibrate("by covariates", scans, residuals, stated),
-    ]
+    stated = {"constant": constant, "by covariates": by_covariates}
     epistemic = None
     if found.disagreement_nm is not None:
-        wider = [
+        stated["by covariates, disagreement added"] = [
             Stated(np.hypot(own.scale_nm, apart), own.tails)
-            for own, apart in zip(stated, found.disagreement_nm, strict=True)
+            for own, apart in zip(by_covariates, found.disagreement_nm, strict=True)
         ]
-        calibrations.append(calibrate("by covariates, disagreement added", scans, residuals, wider))
         epistemic = float(np.sqrt(np.mean([np.mean(d**2) for d in found.disagreement_nm])))
     finite = np.concatenate([residual[np.isfinite(residual)] for residual in residuals])
     return SpreadAnalysis(
@@ -185,8 +180,8 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
         residual_mae_nm=float(np.abs(finite).mean()),
         epistemic_rms_nm=epistemic,
         variance=variance_model(*fit_spread(np.concatenate(designs), np.concatenate(samples))),
-        bins=_bins(scans, places, residuals, stated),
-        calibrations=calibrations,
+        bins=_bins(scans, places, residuals, by_covariates),
+        calibrations=[calibrate(name, scans, residuals, own) for name, own in stated.items()],
         nuisance=found.protocol,
         left_out="prints" if by_print else "scans",
     )
@@ -219,15 +214,12 @@ def calibrate(
     return Calibration(
         name=name,
         levels=list(COVERAGE_LEVELS),
-        nll=float(np.mean([row.nll for row in rows])),
-        crps_nm=float(np.mean([row.crps_nm for row in rows])),
+        **{figure: float(np.mean([getattr(row, figure) for row in rows])) for figure in _MEANS},
         coverage=shares.mean(axis=0).tolist(),
         worst_scan_coverage_90=float(shares[:, COVERAGE_LEVELS.index(0.9)].min()),
         pit=(histogram / len(rows)).tolist(),
         conformal_factor=conformal_factor([row.factor_90 for row in rows]),
         scans=rows,
-        ence=float(np.mean([row.ence for row in rows])),
-        ause=float(np.mean([row.ause for row in rows])),
     )
 
 

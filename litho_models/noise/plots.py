@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report_pictures import LIGHT, new_figure
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.reports.pictures import LIGHT, new_figure
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import READABLE_AT, StepPrint

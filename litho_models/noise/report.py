@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import Page
+from litho_data.reports.page import Page
 from litho_models.evaluation.tables import interval_text
 from litho_models.noise import plots
 from litho_models.noise.budget import NoiseBudget
-from litho_models.noise.calibration import SpreadAnalysis
+from litho_models.noise.calibration import Calibration, ScanCalibration, SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.texture import Texture
@@ -98,16 +98,8 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
 
 def _texture(page: Page, found: Texture) -> None:
     page.paragraph(f"Texture of {found.id}: {found.verdict}.")
-    rows = [
-        {
-            "lines_along": one.along,
-            "share_of_variance": one.share,
-            **(one.period.model_dump() if one.period else {}),
-        }
-        for one in found.lines
-    ]
     page.table(
-        rows,
+        found.lines,
         f"Strength of the direction {found.strength:.2f}: 0 where all directions are alike (chance of as "
         f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: of the variance, in the means "
         "of the lines along each axis; of their squares, in the strongest period. p: chance of such a peak "
@@ -172,42 +164,13 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     )
     page.heading(f"What the uncertainty of {found.model} depends on", folded=True)
     page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
-    rows = [
-        {
-            "σ": one.name,
-            "nll": one.nll,
-            "crps_nm": one.crps_nm,
-            "ence": one.ence,
-            "ause": one.ause,
-            **{
-                f"cover {100 * level:.0f} %": 100 * share
-                for level, share in zip(one.levels, one.coverage, strict=True)
-            },
-            "worst scan at 90 %": 100 * one.worst_scan_coverage_90,
-            "factor for 90 % of scans": one.conformal_factor
-            if one.conformal_factor is not None
-            else float("nan"),
-        }
-        for one in found.calibrations
-    ]
     page.table(
-        rows,
+        [row for one in found.calibrations for row in _covered(one, [one], {"levels", "pit", "scans"})],
         "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
         "calibration.csv",
         digits=3,
     )
-    scans = [
-        {
-            "σ": one.name,
-            **row.model_dump(exclude={"coverage"}),
-            **{
-                f"coverage_{100 * level:.0f}": share
-                for level, share in zip(one.levels, row.coverage, strict=True)
-            },
-        }
-        for one in found.calibrations
-        for row in one.scans
-    ]
+    scans = [row for one in found.calibrations for row in _covered(one, one.scans)]
     page.table(scans, "By scan.", "calibration_scans.csv", digits=3)
     page.table(
         {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients},
@@ -215,16 +178,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         "variance.csv",
         digits=4,
     )
-    bins = [
-        {
-            **row.model_dump(),
-            "coverage_68_ci95": _percent(row.coverage_68_ci95),
-            "coverage_95_ci95": _percent(row.coverage_95_ci95),
-        }
-        for row in found.bins
-    ]
     page.table(
-        bins,
+        found.bins,
         "By level, and in ranges of equal count of what else σ depends on; intervals over prints.",
         "spread.csv",
         digits=3,
@@ -239,29 +194,14 @@ def _budget(page: Page, found: NoiseBudget) -> None:
         "scans before is missing, a few percent of the variance."
     )
     if found.floor.by_policy:
-        rows = [
-            {
-                "policy": row.policy,
-                "k": row.k,
-                "mae_nm": row.mae_nm,
-                "mae_ci95_nm": interval_text(row.mae_ci95_nm),
-                "sigma_nm": row.rmse_nm,
-                "sigma_ci95_nm": interval_text(row.rmse_ci95_nm),
-            }
-            for row in found.floor.by_policy
-        ]
         page.table(
-            rows,
+            found.floor.by_policy,
             "Noise by the scan terms that are set free (k per scan), from like layout surroundings in "
             "different scans; 95 % intervals over prints.",
             "budget.csv",
         )
-    flat = [
-        {**row.model_dump(exclude={"ci95_nm"}), "sigma_ci95_nm": interval_text(row.ci95_nm)}
-        for row in found.flat_levels
-    ]
     page.table(
-        flat,
+        found.flat_levels,
         f"Where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels); tilt, "
         "bow, gain and line offsets of each scan are free.",
         "flat_levels.csv",
@@ -279,5 +219,11 @@ def _shape(freedom: float | None) -> str:
     return "Gaussian" if freedom is None else f"Student's t with {freedom:g} degrees of freedom"
 
 
-def _percent(interval: tuple[float, float] | None) -> str:
-    return "–" if interval is None else f"{interval[0]:.3f} … {interval[1]:.3f}"
+def _covered(
+    one: Calibration, rows: Sequence[Calibration | ScanCalibration], without: Collection[str] = ()
+) -> Iterator[dict[str, object]]:
+    """Rows of a calibration, or of its scans, with a column for each level of its coverage."""
+    for row in rows:
+        shares = zip(one.levels, row.coverage, strict=True)
+        known = row.model_dump(exclude={"name", "coverage", *without})
+        yield {"σ": one.name, **known} | {f"coverage_{100 * level:.0f}": share for level, share in shares}

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaln, gammaln, ndtr, ndtri, stdtr, stdtrit
+from scipy.special import betaln
+from scipy.stats import t as student
 
 COVERAGE_LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 # Mean absolute value of a Gaussian of standard deviation 1.
@@ -25,12 +26,7 @@ class Tails:
 
     def log_likelihood(self, residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
         """Log density per pixel; residual and scale in one unit, which decides the zero."""
-        z2 = (residual / scale) ** 2
-        if np.isinf(self.freedom):
-            return -np.log(scale) - 0.5 * z2 - 0.5 * np.log(2 * np.pi)
-        n = self.freedom
-        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - 0.5 * np.log(n * np.pi)
-        return constant - np.log(scale) - (n + 1) / 2 * np.log1p(z2 / n)
+        return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: np.ndarray) -> np.ndarray | float:
         """−2 d log density / d z²: how much a squared residual counts, 1 for a Gaussian."""
@@ -44,16 +40,15 @@ class Tails:
     @property
     def sd(self) -> float:
         """Standard deviation over the scale; more than two degrees of freedom."""
-        return 1.0 if np.isinf(self.freedom) else float(np.sqrt(self.freedom / (self.freedom - 2)))
+        return float(student.std(self.freedom))
 
     def probability_below(self, z: np.ndarray | float) -> np.ndarray:
         """Distribution of z; of a residual over its scale it is uniform where both are right (PIT)."""
-        return ndtr(z) if np.isinf(self.freedom) else stdtr(self.freedom, z)
+        return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
         """Half width of the central interval that holds ``level``, over the scale."""
-        share = 0.5 + level / 2
-        return float(ndtri(share) if np.isinf(self.freedom) else stdtrit(self.freedom, share))
+        return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: np.ndarray, scale: np.ndarray | float, level: float) -> np.ndarray:
         """Whether each pixel lies within the central interval that should hold ``level`` of them."""
@@ -65,14 +60,11 @@ class Tails:
         It is the mean absolute error of a prediction that states its own spread; for scale → 0 it is |r|. Of
         Student's t after Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
-        z = residual / scale
-        if np.isinf(self.freedom):
-            density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
-            return scale * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))
-        n = self.freedom
-        density = np.exp(self.log_likelihood(z, 1.0))
+        z, n = residual / scale, self.freedom
+        density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
+        if np.isinf(n):
+            return scale * (slope + 2 * density - 1 / np.sqrt(np.pi))
         constant = 2 * np.sqrt(n) / (n - 1) * np.exp(betaln(0.5, n - 0.5) - 2 * betaln(0.5, n / 2))
-        slope = z * (2 * stdtr(n, z) - 1)
         return scale * (slope + 2 * density * (n + z**2) / (n - 1) - constant)
 
 

@@ -27,9 +27,8 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision
 from litho_models.loop.single_scans import SingleScans
-from litho_models.planning.noise import left_nm
-from litho_models.planning.power import PRINT_SHARE, Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals
+from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
+from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
 from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index

@@ -11,6 +11,7 @@ from litho_data.cards.card import Use
 from litho_data.foundation.files import atomic_file
 from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
+from litho_data.reports.page import filled
 from litho_models.planning.designer import WORDS
 from litho_models.planning.layouts import Limits
 from litho_models.planning.record import NextPrint, PlannedScan
@@ -18,6 +19,7 @@ from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 
 PRINT_PATTERN = r"N(?P<print>\d+)F\d+"
 PRINTER_SHEET, MICROSCOPE_SHEET = "printer.md", "microscope.md"
+_TEMPLATES = Path(__file__).parent
 HOLDS = (
     "card.toml",
     "scans.csv",
@@ -113,62 +115,11 @@ def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], pri
         grating={"period_um": _grating_um(plan)},
     )
     plan.write(folder)
-    for name, lines in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
+    for name in (PRINTER_SHEET, MICROSCOPE_SHEET):
+        sheet = filled(_TEMPLATES / f"{name}.jinja", plan=plan, uses=_USES, grating_um=_grating_um(plan))
         with atomic_file(folder / name) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            temporary.write_text(sheet, encoding="utf-8")
 
 
 def _grating_um(plan: NextPrint) -> float:
     return next((one for one in _PERIODS_UM if _FEWEST_PERIODS * one <= plan.field_um), _PERIODS_UM[-1])
-
-
-def _printer_sheet(plan: NextPrint) -> list[str]:
-    printed = [scan for scan in plan.scans if scan.use in _USES or scan.id.endswith("F1")]
-    return [
-        f"# Printing for {plan.dataset.name}",
-        "",
-        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the resist and recipe of the "
-        "prints so far, none turned. Write along x, one line below the other. Print the references once.",
-        "",
-        "| order | layout | centre in the write field (x, y), µm | dose, of the recipe's | what it is |",
-        "|---|---|---|---|---|",
-        *(
-            f"| {scan.order} | layouts/{scan.id}.tif | {scan.field_x_um:g}, {scan.field_y_um:g} | "
-            f"{scan.dose:g} | {_USES.get(scan.use, 'print')} |"
-            for scan in printed
-        ),
-        "",
-        "Dose is what the resist takes up: with two photons it goes with the square of the laser power, so "
-        "that 0.8 of it takes 0.89 of the power.",
-        "Note the laser power before each print, and anything that went otherwise than written here.",
-    ]
-
-
-def _microscope_sheet(plan: NextPrint) -> list[str]:
-    return [
-        f"# Scanning for {plan.dataset.name}",
-        "",
-        f"{len(plan.scans)} scans in this order. Save raw heights, not levelled, one file per scan: "
-        "`scans/ID.txt`, heights in metres (or change `[scan]` of `card.toml` to your format and size). A "
-        "margin of 1 to 2 µm around the print helps. Take the print out and put it back between two scans of "
-        "it. Leave the file as the microscope shows it: do not turn it back.",
-        "",
-        f"The grating is a standard, no print: a square one of {_grating_um(plan):g} µm, or another of which "
-        "eight periods fit into a scan, laid along the axes of the scan. Put its period and its uncertainty "
-        "into `[grating]` of `card.toml` (`period_um`, `uncertainty_um`). Without one leave its file out.",
-        "",
-        "| order | scan | print | turned | direction | tip | pixels | why |",
-        "|---|---|---|---|---|---|---|---|",
-        *(
-            f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | "
-            f"{'there' if scan.direction > 0 else 'back'} | {'as before' if scan.tip == 1 else 'new'} | "
-            f"{'as before' if scan.pixel_size == 1 else f'{scan.pixel_size:g} of their size'} | {scan.why} |"
-            for scan in plan.scans
-        ),
-        "",
-        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`, "
-        "`pixel_size`): a turned scan without its column is refused. Then",
-        "",
-        "    litho-data build card.toml --out next.zarr",
-        "    litho-models close-loop prints.zarr next.zarr --out decided",
-    ]

@@ -27,10 +27,18 @@ from litho_models.loop.record import CloseLoop
 from litho_models.loop.results import clustered_covariance, independent
 from litho_models.loop.screening import Screened
 from litho_models.loop.search import WORTH_FITTING, Cause, separating
-from litho_models.planning.noise import left_nm, noise_spectrum
-from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival, fit_rivals
+from litho_models.planning.questions import (
+    Kind,
+    OpenQuestions,
+    Owner,
+    Question,
+    Rival,
+    fit_rivals,
+    left_nm,
+    noise_spectrum,
+)
 from litho_models.scan_terms import line_terms, terms_of_effect
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 
 # Members of a set, or suspects: every pair of rivals is compared on every layout.
 _MOST_MEMBERS = 3

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, capitalised
-from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
-from litho_models.planning.power import ENOUGH
+from litho_data.reports.page import Page, capitalised
+from litho_data.reports.pictures import new_figure
+from litho_models.planning.answers import ENOUGH
 from litho_models.planning.record import NextPrint
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
 
@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN_LAYOUTS = 4
-_COLUMNS = ("name", "status", "prints_needed", "difference_nm", "noise_nm", "form_nm", "text")
+_COLUMNS = (
+    "name",
+    "status",
+    "prints_needed",
+    "difference_nm",
+    "noise_nm",
+    "form_nm",
+    "text",
+    "power",
+    "random_power",
+)
 
 
 def write_report(
@@ -42,13 +52,13 @@ def write_report(
     )
     rows = [
         {
-            **q.model_dump(include={*_COLUMNS}),
+            **q.model_dump(),
             "power": q.power[plan.prints - 1],
             "random_power": q.random_power[plan.prints - 1],
         }
         for q in plan.questions
     ]
-    page.table(rows, "Open questions, and what the plan makes of them.", "questions.csv")
+    page.table(rows, "Open questions, and what the plan makes of them.", "questions.csv", columns=_COLUMNS)
     pictured = {rivalry.question.name: rivalry for rivalry in rivalries}
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)

@@ -26,8 +26,7 @@ from litho_models.fitting.least_squares import Linearised, eliminated_sum, ortho
 from litho_models.loop.fits import ALL_FREE, RULES
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import sample_border_px
-from litho_models.planning.noise import NoiseSpectrum
-from litho_models.planning.questions import Question
+from litho_models.planning.questions import NoiseSpectrum, Question
 from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator
 

@@ -40,13 +40,12 @@ def close_loop(
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
         open_ = open_questions(closed, result, report)
-        settings = {**result.settings, "new_prints": [one.sha256 for one in further]}
-        result = result.model_copy(update={"settings": settings})
         if new:
             result = with_decisions(result, open_, decide(closed, open_, new, report))
         return result, [open_]
 
-    return run.close_loop(store, out, further=asked, report=report, **settings)
+    used = [one.sha256 for one in further]
+    return run.close_loop(store, out, further=asked, decided_by=used, report=report, **settings)
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:

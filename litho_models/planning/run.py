@@ -10,10 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import record_sha256
-from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.foundation.run_facts import run_info
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
@@ -57,7 +56,6 @@ def next_print(
     Raises:
         InputError: no closed loop, prints of an impossible size, or a folder with a plan of other settings.
     """
-    require_replaceable_folder(out, *HOLDS)
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():
         raise InputError(
@@ -70,7 +68,6 @@ def next_print(
         return None
     asked = {"prints": prints, "field_um": field_um, "seed": seed, "steps": steps, "layouts": layouts}
     facts = {"dataset": open_.dataset.model_dump(mode="json"), "settings": asked}
-    require_same_settings(out, NextPrint.FILE_NAME, facts)
     card = ModelCard.read(folder / MODEL_FOLDER)
     size_px = round(field_um / card.pitch_um)
     if size_px < _SMALLEST_PX or prints < 1:
@@ -79,69 +76,70 @@ def next_print(
             got=f"{prints} of {field_um:g} µm",
             wanted=f"at least one of {_SMALLEST_PX * card.pitch_um:g} µm",
         )
-    base = load_simulator(folder / MODEL_FOLDER, card)
-    limits = Limits.of(open_, card.pitch_um)
-    printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
-    rivalries = [Rivalry(one, base, printing, open_.noise) for one in open_.questions if one.rivals]
-    tile_px = min(TILE_PX, size_px)
-    can_move = open_.write_field_um is not None and open_.write_field_um > field_um
-    choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
-    # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
-    turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
-    chosen = together(choices, turned)
-    count = _TILES if size_px > tile_px else prints
-    tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
-    # Finished tiles of an interrupted run.
-    cache = Path(f"{out}-cache")
-    if rivalries and layouts == "optimised":
-        kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
-        tiles, starts = climbed(
-            rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
+    with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
+        base = load_simulator(folder / MODEL_FOLDER, card)
+        limits = Limits.of(open_, card.pitch_um)
+        printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
+        rivalries = [Rivalry(one, base, printing, open_.noise) for one in open_.questions if one.rivals]
+        tile_px = min(TILE_PX, size_px)
+        can_move = open_.write_field_um is not None and open_.write_field_um > field_um
+        choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
+        # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
+        turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
+        chosen = together(choices, turned)
+        count = _TILES if size_px > tile_px else prints
+        tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
+        # Finished tiles of an interrupted run.
+        cache = Path(f"{out}-cache")
+        if rivalries and layouts == "optimised":
+            kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
+            tiles, starts = climbed(
+                rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
+            )
+        planned = [
+            PlannedPrint(
+                as_tensor(assemble(tiles, number, size_px, limits)),
+                chosen.ways,
+                chosen.places[number % len(chosen.places)],
+                number / max(prints - 1, 1) - 0.5,
+                chosen.doses[number % len(chosen.doses)],
+            )
+            for number in range(prints)
+        ]
+        report("comparing the rivals on the planned prints, and on random ones")
+        judged = planned[:_JUDGED]
+        random = [
+            replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i)))
+            for i, one in enumerate(judged)
+        ]
+        answered = {
+            rivalry.question.name: of_rivals(rivalry, choice.tried, judged, random, prints)
+            for rivalry, choice in zip(rivalries, choices, strict=True)
+        }
+        questions = [
+            answered.get(one.name) or of_others(one, open_, prints, len(chosen.ways), size_px)
+            for one in open_.questions
+        ]
+        needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
+        # One print alone may have a defect.
+        planned = planned[: max([_FEWEST_PRINTS, *needed])]
+        scans, maps = schedule(planned, limits, printing, seed)
+        levels = np.stack([one.level.numpy() for one in planned]).astype(int)
+        share = np.bincount(levels.ravel(), minlength=card.levels) / levels.size
+        plan = NextPrint(
+            run=run_info([seed], len(scans)),
+            dataset=open_.dataset,
+            settings=asked,
+            prints=len(planned),
+            field_um=field_um,
+            levels=(limits.lowest, limits.highest),
+            cutoff_per_um=limits.cutoff_per_um,
+            smallest_feature_um=0.5 / limits.cutoff_per_um,
+            level_distance=float(0.5 * np.abs(share - open_.level_share).sum()),
+            starts=starts,
+            scans=scans,
+            questions=questions,
         )
-    planned = [
-        PlannedPrint(
-            as_tensor(assemble(tiles, number, size_px, limits)),
-            chosen.ways,
-            chosen.places[number % len(chosen.places)],
-            number / max(prints - 1, 1) - 0.5,
-            chosen.doses[number % len(chosen.doses)],
-        )
-        for number in range(prints)
-    ]
-    report("comparing the rivals on the planned prints, and on random ones")
-    judged = planned[:_JUDGED]
-    random = [
-        replace(one, level=as_tensor(limits.random(size_px, seed + 101 + i))) for i, one in enumerate(judged)
-    ]
-    answered = {
-        rivalry.question.name: of_rivals(rivalry, choice.tried, judged, random, prints)
-        for rivalry, choice in zip(rivalries, choices, strict=True)
-    }
-    questions = [
-        answered.get(one.name) or of_others(one, open_, prints, len(chosen.ways), size_px)
-        for one in open_.questions
-    ]
-    needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
-    # One print alone may have a defect.
-    planned = planned[: max([_FEWEST_PRINTS, *needed])]
-    scans, maps = schedule(planned, limits, printing, seed)
-    levels = np.stack([one.level.numpy() for one in planned]).astype(int)
-    share = np.bincount(levels.ravel(), minlength=card.levels) / levels.size
-    plan = NextPrint(
-        run=run_info([seed], len(scans)),
-        dataset=open_.dataset,
-        settings=asked,
-        prints=len(planned),
-        field_um=field_um,
-        levels=(limits.lowest, limits.highest),
-        cutoff_per_um=limits.cutoff_per_um,
-        smallest_feature_um=0.5 / limits.cutoff_per_um,
-        level_distance=float(0.5 * np.abs(share - open_.level_share).sum()),
-        starts=starts,
-        scans=scans,
-        questions=questions,
-    )
-    with atomic_folder(out) as target:
         write_plan(target, plan, maps, printing)
         write_report(target, plan, rivalries, planned)
     shutil.rmtree(cache, ignore_errors=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from litho_data.foundation.commands import progress
+from litho_data.commands.progress import progress
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 

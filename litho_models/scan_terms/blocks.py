@@ -90,3 +90,11 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
             other_side[axis] = np.broadcast_to(beyond, shape)
         cells.append(Cell(score, other_side))
     return cells
+
+
+def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
+    """Flat indices of about so many of the used pixels (ny, nx), on a square lattice."""
+    stride = max(1, round((used.sum() / count) ** 0.5))
+    lattice = np.zeros_like(used)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    return np.flatnonzero(used & lattice)

@@ -23,9 +23,9 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
 from litho_models.scan_terms.background import field_um, is_of_size
+from litho_models.scan_terms.blocks import thinned
 from litho_models.scan_terms.cross_fit import least_squares
-from litho_models.scan_terms.grouped import Block, Products
-from litho_models.scan_terms.groups import ALL, groupings, label_of
+from litho_models.scan_terms.grouped import ALL, Block, Products, groupings, label_of
 from litho_models.scan_terms.term import FloatMap
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
@@ -246,7 +246,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     What the parts of the model explain is put back, to first order: their strengths are then fitted anew as
     a whole, so that they are shrunk once, however often.
     """
-    at = _thinned(scan.usable)
+    at = thinned(scan.usable, _SAMPLED_PX)
     seen = _displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
     slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
     shapes = _polynomials(scan.shape, _HIGHEST).reshape(_count(_HIGHEST), -1)[:, at]
@@ -285,7 +285,7 @@ def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levellin
         levelled = model.model_copy(update={"levelling": levelling})
         rests = []
         for scan, prediction in pairs:
-            at = _thinned(scan.usable)
+            at = thinned(scan.usable, _SAMPLED_PX)
             rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
             rests.append(least_squares(_polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at], rest))
         return float((np.var(rests, axis=0) * weights)[1:].sum())
@@ -328,13 +328,6 @@ def _polynomials(shape: tuple[int, ...], degree: int) -> FloatMap:
 
 def _count(degree: int) -> int:
     return (degree + 1) * (degree + 2) // 2
-
-
-def _thinned(usable: np.ndarray) -> np.ndarray:
-    stride = max(1, round((usable.sum() / _SAMPLED_PX) ** 0.5))
-    lattice = np.zeros_like(usable)
-    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    return np.flatnonzero(usable & lattice)
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:

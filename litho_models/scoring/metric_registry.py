@@ -14,6 +14,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.store import PrintedScan
+from litho_models.scoring.films import FILMS_TEXT, films_of_scan
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.scoring.shapes import EDGES_TEXT, SIMILARITY_TEXT, edges_of_scan, similarity_of_scan
 
@@ -35,15 +36,19 @@ class Metric(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Metrics that one function gives together, in this order, and what they are, in a sentence."""
+    """Metrics that one function gives together, in this order, and what they are, in a sentence.
+
+    ``instrument``: the kind whose scans have them; all, if empty.
+    """
 
     metrics: tuple[Metric, ...]
     function: Callable[[PrintedScan, np.ndarray, np.ndarray], Sequence[float | None]]
     explanation: str
+    instrument: str = ""
 
 
 _MEASUREMENTS = [
-    Measurement((Metric("ssim", "1"),), lambda *scan: (similarity_of_scan(*scan),), SIMILARITY_TEXT),
+    Measurement((Metric("ssim", "1"),), lambda *scan: (similarity_of_scan(*scan),), SIMILARITY_TEXT, "afm"),
     Measurement(
         (
             Metric("edge_mean", "nm"),
@@ -54,6 +59,15 @@ _MEASUREMENTS = [
         ),
         edges_of_scan,
         EDGES_TEXT,
+    ),
+    Measurement(
+        (
+            Metric("area_error", "percent"),
+            *(Metric(f"features_{name}", "1", "sum") for name in ("missing", "extra", "merged")),
+        ),
+        films_of_scan,
+        FILMS_TEXT,
+        "sem",
     ),
 ]
 
@@ -112,6 +126,8 @@ def metrics_of(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.nda
     """
     values: dict[str, float | None] = {}
     for measurement in _MEASUREMENTS:
+        if measurement.instrument not in ("", scan.seen_by):
+            continue
         found = measurement.function(scan, prediction_um, residual_um)
         values |= {m.key: _number(m, value) for m, value in zip(measurement.metrics, found, strict=True)}
     return _as_fields(values)
@@ -121,6 +137,8 @@ def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
     """The metrics of a model from those of its scans: means of what is known, or sums, as fields."""
     values = {}
     for metric in registered_metrics():
+        if not any(metric.key in ScanRow.model_fields or metric.key in row.metrics for row in rows):
+            continue
         known = [value for value in (row.metric(metric.key) for row in rows) if value is not None]
         mean = float(np.mean(known)) if known else None
         values[metric.key] = sum(known) if metric.over_scans == "sum" else mean

@@ -1,31 +1,35 @@
-"""The errors of one scan, over its valid pixels."""
+"""The errors of one scan, over its valid pixels, and what they say about the state of the printer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.scan_terms import Blocks, Policy, cross_fit, policy_terms
+from litho_data.store import PrintedScan
+from litho_models.scan_terms import POLICIES, Blocks, CrossFit, cross_fit
+from litho_models.scan_terms.cross_fit import fitted_terms
+from litho_models.scoring.records import ScanErrors
 
 # The step of index from air to the resist, at a red helium-neon line: where its elements are used.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """Measured height = slope · prediction + intercept, µm; standard errors and correlation of the two.
+    """Measured height = slope · prediction + intercept; standard errors and correlation of the two.
 
     NaN where they cannot be known: a constant prediction has no slope, a single block no errors.
     """
 
     slope: float
-    intercept_um: float
+    intercept_nm: float
     slope_error: float
-    intercept_error_um: float
-    correlation: float
+    intercept_error_nm: float
+    slope_intercept_correlation: float
 
 
 def print_gain(
@@ -46,7 +50,7 @@ def print_gain(
     power = float(((x - middle) ** 2).sum())
     if power <= 0:
         nan = float("nan")
-        return PrintGain(nan, float(y.mean()), nan, nan, nan)
+        return PrintGain(nan, NM_PER_UM * float(y.mean()), nan, nan, nan)
     # About the mean of the prediction slope and height are estimated independently of each other.
     regressors = np.stack([np.full(x.size, 1 / x.size), (x - middle) / power])
     height, slope = regressors @ y
@@ -61,56 +65,21 @@ def print_gain(
     errors = float(np.sqrt(slope_variance)), float(np.sqrt(intercept_variance))
     return PrintGain(
         slope=float(slope),
-        intercept_um=float(height - slope * middle),
+        intercept_nm=NM_PER_UM * float(height - slope * middle),
         slope_error=errors[0],
-        intercept_error_um=errors[1],
-        correlation=float(shared / (errors[0] * errors[1])) if min(errors) > 0 else float("nan"),
+        intercept_error_nm=NM_PER_UM * errors[1],
+        slope_intercept_correlation=float(shared / np.prod(errors)) if min(errors) > 0 else float("nan"),
     )
 
 
-@dataclass(frozen=True)
-class ScanScore:
-    """Error of one model on one scan, nm over the scored pixels.
-
-    ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are
-    freed of the nuisances of ``policy``, fitted on other pixels, with ``degrees_of_freedom`` terms.
-    ``line_sd_um``: standard deviation of the offsets of lines among them.
-    """
-
-    scan_id: str
-    policy: str
-    degrees_of_freedom: float
-    line_sd_um: float
-    pixels: int
-    mae_abs_nm: float
-    bias_nm: float
-    mae_datum_free_nm: float
-    rmse_datum_free_nm: float
-    median_abs_datum_free_nm: float
-    p95_abs_datum_free_nm: float
-    slope: float
-    slope_error: float
-    intercept_nm: float
-    intercept_error_nm: float
-    slope_intercept_correlation: float
-
-
-def score_scan(
-    scan_id: str,
-    height_um: np.ndarray,
-    prediction_um: np.ndarray,
-    valid: np.ndarray,
-    policy: Policy = "offset",
-    blocks: Blocks | None = None,
-) -> ScanScore:
-    """Score one prediction against one scan; arrays (ny, nx) in µm, the rest as in ``cross_fit``.
+def scan_errors(scan_id: str, height_um: np.ndarray, prediction_um: np.ndarray, free: CrossFit) -> ScanErrors:
+    """Score one prediction against one scan, (ny, nx) µm each, on the pixels that ``cross_fit`` scores.
 
     Slope and intercept, the gain and offset of the print, are those of ``print_gain``.
 
     Raises:
-        InputError: what ``cross_fit`` refuses, or no valid pixel.
+        InputError: no valid pixel.
     """
-    free = cross_fit(height_um, prediction_um, valid, policy_terms(policy), blocks)
     scored = np.isfinite(free.residual_um)
     if not scored.any():
         raise InputError(f"scan {scan_id}", got="no valid pixel", wanted="at least one to score")
@@ -118,11 +87,8 @@ def score_scan(
     plain = (height - prediction) * NM_PER_UM
     error = np.abs(free.residual_um[scored]) * NM_PER_UM
     line = print_gain(height_um, prediction_um, scored)
-    return ScanScore(
-        scan_id=scan_id,
-        policy=policy,
-        degrees_of_freedom=free.degrees_of_freedom,
-        line_sd_um=free.line_sd_um,
+    known = {name: None if np.isnan(value) else value for name, value in line._asdict().items()}
+    return ScanErrors(
         pixels=int(scored.sum()),
         mae_abs_nm=float(np.abs(plain).mean()),
         bias_nm=float(plain.mean()),
@@ -130,14 +96,98 @@ def score_scan(
         rmse_datum_free_nm=float(np.sqrt((error**2).mean())),
         median_abs_datum_free_nm=float(np.median(error)),
         p95_abs_datum_free_nm=float(np.quantile(error, 0.95)),
-        slope=line.slope,
-        slope_error=line.slope_error,
-        intercept_nm=line.intercept_um * NM_PER_UM,
-        intercept_error_nm=line.intercept_error_um * NM_PER_UM,
-        slope_intercept_correlation=line.correlation,
+        **known,
     )
+
+
+def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[np.ndarray]) -> float:
+    """Mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
+    fits = (
+        cross_fit(scan.height_um, height, scan.valid, POLICIES["offset"])
+        for scan, height in zip(scans, heights_um, strict=True)
+    )
+    return NM_PER_UM * float(np.mean([np.nanmean(np.abs(fit.residual_um)) for fit in fits]))
 
 
 def phase_waves(height_error_um: float) -> float:
     """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
     return height_error_um * INDEX_STEP / WAVELENGTH_UM
+
+
+_SURFACE = frozenset({"offset", "bow"})
+
+
+class ScanFigures(Record):
+    """Figures of one scan against a model, both free of the scan's offset, tilt and bow.
+
+    ``gain``: measured over predicted height, with its standard error (of blocks, see ``print_gain``; None for
+    a single block). ``error_nm``: mean absolute error with the gain free too (policy ``full``, k = 7), terms
+    fitted on other pixels. ``order``: of printing. ``relief_nm``: standard deviation of the predicted height,
+    and ``steepness`` its rms slope, which tell layouts of one kind from others. ``held_out``: whether the
+    prediction is of a model that had not seen the scan.
+    """
+
+    scan: str
+    print: str
+    order: int
+    gain: float
+    gain_error: float | None
+    error_nm: float
+    pixels: int
+    relief_nm: float
+    steepness: float
+    dose: float | None = None
+    held_out: bool = True
+
+
+def scan_figures(
+    scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
+) -> ScanFigures | None:
+    """Figures of a scan; None where the layout is flat, so that there is no gain.
+
+    Offset, tilt and bow are taken out of height and prediction alike, which gives the gain that a joint fit
+    of all terms would (Frisch and Waugh 1933).
+
+    Args:
+        scan: the scan; ``prediction_um``: what the model expects of it, (ny, nx) µm.
+        held_out: whether the model had not seen it.
+
+    Raises:
+        InputError: what ``cross_fit`` refuses.
+    """
+    blocks = Blocks()
+    residual = cross_fit(scan.height_um, prediction_um, scan.valid, POLICIES["full"], blocks).residual_um
+    used = np.isfinite(residual)
+    level = np.zeros(scan.shape)
+    height, expected = (
+        np.asarray(part, np.float64) - fitted_terms(part, level, used, _SURFACE)[1]
+        for part in (scan.height_um, prediction_um)
+    )
+    line = print_gain(height, expected, used, block_px=blocks.block_px)
+    if np.ptp(scan.mask_level) == 0 or not np.isfinite(line.slope):
+        return None
+    return ScanFigures(
+        scan=scan.id,
+        print=scan.print_id,
+        order=scan.order,
+        gain=line.slope,
+        gain_error=line.slope_error if np.isfinite(line.slope_error) else None,
+        error_nm=NM_PER_UM * float(np.abs(residual[used]).mean()),
+        pixels=int(used.sum()),
+        relief_nm=NM_PER_UM * float(expected[used].std()),
+        steepness=float(np.sqrt(sum(np.mean(part**2) for part in np.gradient(expected, scan.pitch_um)))),
+        dose=scan.dose,
+        held_out=held_out,
+    )
+
+
+def baseline_of(
+    scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
+) -> list[dict[str, Any]]:
+    """Figures of the scans that a model was made of, for its card; none where fields are too small."""
+    pairs = zip(scans, predictions_um, strict=True)
+    try:
+        rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]
+    except InputError:
+        return []
+    return [row.model_dump(mode="json") for row in rows if row is not None]

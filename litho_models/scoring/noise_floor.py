@@ -6,7 +6,7 @@ model, by comparing pixels of like layout surroundings (``like_layouts``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -18,7 +18,7 @@ from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_data.store.schema import DatasetId
-from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
+from litho_models.scan_terms import POLICIES, Blocks, CrossFit, Policy, cross_fit
 from litho_models.scoring.like_layouts import LikePixels, like_pixels
 from litho_models.scoring.statistics import pixel_interval
 
@@ -121,22 +121,25 @@ def estimated_floor(
 
 
 def freed_by_policy(
-    scans: Sequence[PrintedScan], maps_um: Sequence[np.ndarray], blocks: Blocks | None = None
-) -> dict[Policy, tuple[float, list[np.ndarray]]]:
-    """For each policy its terms per scan and the residual of each scan, (ny, nx) µm, NaN where not scored."""
-    freed: dict[Policy, tuple[float, list[np.ndarray]]] = {}
-    for policy, terms in POLICIES.items():
-        pairs = zip(scans, maps_um, strict=True)
-        fits = [cross_fit(scan.height_um, expected, scan.valid, terms, blocks) for scan, expected in pairs]
-        mean_k = float(np.mean([fit.degrees_of_freedom for fit in fits]))
-        freed[policy] = mean_k, [fit.residual_um for fit in fits]
-    return freed
+    scans: Sequence[PrintedScan],
+    maps_um: Sequence[np.ndarray],
+    blocks: Blocks | None = None,
+    policies: Iterable[Policy] = tuple(POLICIES),
+) -> dict[Policy, list[CrossFit]]:
+    """Each scan freed of the terms of each policy; ``maps_um``: (ny, nx) µm, expected of it."""
+    return {
+        policy: [
+            cross_fit(scan.height_um, expected, scan.valid, POLICIES[policy], blocks)
+            for scan, expected in zip(scans, maps_um, strict=True)
+        ]
+        for policy in policies
+    }
 
 
 def floor_of_residuals(
     model: str,
     scans: Sequence[PrintedScan],
-    residuals_um: Mapping[Policy, tuple[float, Sequence[np.ndarray]]],
+    freed: Mapping[Policy, Sequence[CrossFit]],
     seed: int = 0,
 ) -> NoiseFloor:
     """An upper estimate of the floor, from residuals of scans that a model had not seen.
@@ -150,21 +153,19 @@ def floor_of_residuals(
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        residuals_um: for each policy, ``offset`` among them, its terms per scan and the residual of each
-            scan, (ny, nx), NaN where not scored.
+        freed: of ``freed_by_policy``, ``offset`` among them.
         seed: of the pixels drawn.
     """
     # In the order of their ids, so that whoever asks about the same scans draws the same pixels.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
-    offset_free = [residuals_um["offset"][1][number] for number in order]
-    drawn = like_pixels(scans, [np.isfinite(residual) for residual in offset_free], seed)
+    scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]
+    drawn = like_pixels(scans, scored, seed)
     if drawn is None:
         return UNKNOWN_FLOOR
     prints = [scan.print_id for scan in scans]
     rows = [
-        _floor(policy, k, drawn, [NM_PER_UM * residuals[number] for number in order], prints)
-        for policy, (k, residuals) in residuals_um.items()
+        _floor(policy, drawn, [fits[number] for number in order], prints) for policy, fits in freed.items()
     ]
     offset = next(row for row in rows if row.policy == "offset")
     return NoiseFloor(
@@ -178,9 +179,8 @@ def floor_of_residuals(
     )
 
 
-def _floor(
-    policy: Policy, k: float, drawn: LikePixels, residuals_nm: Sequence[np.ndarray], prints: Sequence[str]
-) -> PolicyFloor:
+def _floor(policy: Policy, drawn: LikePixels, fits: Sequence[CrossFit], prints: Sequence[str]) -> PolicyFloor:
+    residuals_nm = [NM_PER_UM * fit.residual_um for fit in fits]
     noise, square = drawn.noise_squared(residuals_nm)
     share = noise.mean() / square.mean() if square.any() else 0.0
     mae = float(np.mean([np.nanmean(np.abs(residual)) for residual in residuals_nm]))
@@ -190,7 +190,7 @@ def _floor(
     low, high = (_root(share * end) for end in interval or (0.0, 0.0))
     return PolicyFloor(
         policy=policy,
-        k=k,
+        k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
         mae_nm=shrink * mae,
         mae_ci95_nm=(low * mae, high * mae) if interval else None,
         rmse_nm=shrink * rmse,

@@ -1,20 +1,26 @@
-"""What is scored and what comes out: the protocol, a prediction, and the scores of a scan and of a model."""
+"""What is scored and what comes out: a prediction, the scores of a scan and of a model, scores in pairs."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scoring.statistics import OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
+LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+"""The error by which models are ranked and compared, by the instrument."""
 
 
 class Prediction(NamedTuple):
@@ -69,15 +75,15 @@ class MetricValues(Record):
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-class ScanRow(MetricValues):
-    """The scores of one scan.
+class ScanErrors(Record):
+    """Error of one model on one scan over the scored pixels.
 
-    Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
-    correlation of the two (``print_gain``); None where they cannot be known.
+    ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are freed of
+    terms fitted on other pixels. Slope and intercept, the gain and offset of the print against the
+    prediction, have standard errors and a correlation (``print_gain``); None where they cannot be known.
     """
 
-    scan: str
-    print: str
+    pixels: int
     mae_abs_nm: float
     bias_nm: float
     mae_datum_free_nm: float
@@ -89,7 +95,13 @@ class ScanRow(MetricValues):
     slope_error: float | None = None
     intercept_error_nm: float | None = None
     slope_intercept_correlation: float | None = None
-    pixels: int
+
+
+class ScanRow(MetricValues, ScanErrors):
+    """The scores of one scan."""
+
+    scan: str
+    print: str
 
     @property
     def line_covariance(self) -> np.ndarray | None:
@@ -110,6 +122,8 @@ class ModelScores(MetricValues):
 
     model: str
     scans: list[ScanRow]
+    seen_by: Instrument = "afm"
+    edge_mean_ci95_nm: Interval = None
     mae_abs_nm: float
     mae_abs_ci95_nm: Interval
     bias_nm: float
@@ -126,3 +140,60 @@ class ModelScores(MetricValues):
     scan_line_offset_sd_nm: float
     dropped_pixels: int
     constant_predictions: int
+
+    @property
+    def leading_nm(self) -> float:
+        """The error that ranks models: of edges for films, of heights else; infinite without an edge."""
+        value = getattr(self, LEADING[self.seen_by])
+        return math.inf if value is None else float(value)
+
+    @property
+    def leading_ci95_nm(self) -> Interval:
+        """Its interval."""
+        return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
+
+    @property
+    def leading_of_scans_nm(self) -> dict[str, float]:
+        """The same of every scan by id; not a number where there is no edge."""
+        values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
+        return {scan: math.nan if value is None else value for scan, value in values.items()}
+
+
+class Paired(Record):
+    """Mean over scans of first minus second leading error; negative means the first is better.
+
+    ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
+    """
+
+    first: str
+    second: str
+    mean_nm: float
+    ci95_nm: tuple[float, float] | None
+    p: float
+    first_better: int
+    scans: int
+    over_prints: OverUnits | None = None
+
+
+def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
+    """Compare the leading errors of the same scans, which meet by id: results list them by fold.
+
+    Raises:
+        InputError: scores of different scans.
+    """
+    errors = [score.leading_of_scans_nm for score in (first, second)]
+    if errors[0].keys() != errors[1].keys():
+        counts = " and ".join(str(len(found)) for found in errors)
+        raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
+    differences = [one - errors[1][scan] for scan, one in errors[0].items()]
+    found = over_units(differences, seed=seed)
+    return Paired(
+        first=first.model,
+        second=second.model,
+        mean_nm=float(np.mean(differences)),
+        ci95_nm=found.ci95_nm,
+        p=found.p,
+        first_better=sum(one < 0 for one in differences),
+        scans=found.count,
+        over_prints=over_prints(differences, [row.print for row in first.scans], seed),
+    )

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
+from litho_models.scoring.films import film_edge_um
 
 FloatMap = NDArray[np.float64]
 
 SSIM_RANGE_UM = 1.2
 SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
-SEARCH_UM = 0.5
+SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
 _CANDIDATES = 8
 # Half the longest piece of a contour, the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
@@ -30,16 +31,16 @@ SIMILARITY_TEXT = (
 )
 EDGES_TEXT = (
     "edge_mean and edge_p95 are distances of the measured contours from the predicted ones at the heights "
-    f"half way between nominal levels, over the pieces whose partner lies within {SEARCH_UM:g} µm; the "
-    "counts are of pieces: of the measured contours with and without a partner, of the predicted contours "
-    "without."
+    f"half way between nominal levels, over the pieces whose partner lies within {SEARCH_UM:g} µm (of a "
+    f"film: at half its height, within {FILM_SEARCH_PX:g} px); the counts are of pieces: of the "
+    "measured contours with and without a partner, of the predicted contours without."
 )
 
 
 class EdgePlacement(NamedTuple):
     """Distances of the measured contours' pieces (at most a pixel long) from the expected contour.
 
-    A piece has a partner where the expected contour of the same height passes within ``SEARCH_UM`` and
+    A piece has a partner where the expected contour of the same height passes within the search and
     rises to the same side. ``mean_nm`` and ``p95_nm`` are over pieces with one, None if there are none.
     """
 
@@ -62,8 +63,10 @@ def similarity_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um
 
 def edges_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> EdgePlacement:
     """Edges of a scan freed of its nuisances against those of its prediction."""
-    heights = mid_step_heights_um(scan.levels, scan.level_height_um)
-    return edge_placement(prediction_um + residual_um, prediction_um, heights, scan.pitch_um)
+    heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
+    if scan.seen_by == "sem":
+        heights, search_um = np.array([film_edge_um(scan)]), FILM_SEARCH_PX * scan.pitch_um
+    return edge_placement(prediction_um + residual_um, prediction_um, heights, scan.pitch_um, search_um)
 
 
 def structural_similarity(measured_um: np.ndarray, expected_um: np.ndarray) -> float | None:
@@ -99,7 +102,11 @@ def structural_similarity(measured_um: np.ndarray, expected_um: np.ndarray) -> f
 
 
 def edge_placement(
-    measured_um: np.ndarray, expected_um: np.ndarray, heights_um: np.ndarray, pitch_um: float
+    measured_um: np.ndarray,
+    expected_um: np.ndarray,
+    heights_um: np.ndarray,
+    pitch_um: float,
+    search_um: float = SEARCH_UM,
 ) -> EdgePlacement:
     """Compare the contours of two maps.
 
@@ -107,15 +114,16 @@ def edge_placement(
         measured_um: (ny, nx) µm, NaN where not scored; contours end there in both maps.
         expected_um: (ny, nx) µm.
         heights_um: heights of the contours, µm, see ``mid_step_heights_um``; ``pitch_um``: of the maps, µm.
+        search_um: how far a partner may lie.
     """
     expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
     distances, missing, unexpected = [np.empty(0)], 0, 0
     for height in heights_um:
         measured, expected = _contour(measured_um, height), _contour(expected_um, height)
-        found = _distance_px(measured, expected, SEARCH_UM / pitch_um)
+        found = _distance_px(measured, expected, search_um / pitch_um)
         distances.append(found[np.isfinite(found)])
         missing += int(np.isinf(found).sum())
-        unexpected += int(np.isinf(_distance_px(expected, measured, SEARCH_UM / pitch_um)).sum())
+        unexpected += int(np.isinf(_distance_px(expected, measured, search_um / pitch_um)).sum())
     every = np.concatenate(distances) * pitch_um * NM_PER_UM
     return EdgePlacement(
         mean_nm=float(every.mean()) if every.size else None,

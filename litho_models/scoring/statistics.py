@@ -4,7 +4,6 @@ sign, is a whole scan; where scans of one print share its day and batch, a whole
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -106,53 +105,46 @@ def smallest_flip_p(count: int) -> float:
     return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
 
 
-@dataclass(frozen=True)
-class PairedDifference:
-    """Mean over scans of (first minus second), its bootstrap interval and two-sided sign-flip p.
+class OverUnits(Record):
+    """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
 
-    ``units``: scans, or groups of them, that were resampled and flipped; of these the first is better in
-    ``first_better``, the second in ``second_better``.
+    ``count``: of these; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
+    interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, all combinations up
+    to 14 units and 9,999 random ones beyond, the observed one counted in; not below ``smallest_p``.
     """
 
-    mean: float
-    interval: tuple[float, float]
+    count: int
+    positive: int
+    ci95_nm: tuple[float, float] | None
     p: float
-    first_better: int
-    second_better: int
-    units: int
+    smallest_p: float
 
 
-def paired_difference(
-    first: Sequence[float],
-    second: Sequence[float],
-    *,
-    groups: Sequence[Hashable] | None = None,
-    seed: int = 0,
-) -> PairedDifference:
-    """Compare two lists of errors scan by scan; smaller values are better.
-
-    The null flips the sign of each scan's difference: all combinations up to 14 scans, 9,999 random
-    ones beyond (the observed one counted in). With ``groups``, the print of each scan, the differences
-    of a print are resampled and flipped together.
+def over_units(
+    differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
+) -> OverUnits:
+    """A difference per scan, resampled over scans, or over ``groups``, the print of each scan.
 
     Raises:
-        InputError: lists of different length, or empty.
+        InputError: no difference.
     """
-    if len(first) != len(second) or not first:
-        raise InputError(
-            "paired scores", got=f"{len(first)} and {len(second)} scans", wanted="the same scans in both"
-        )
-    difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    sums, _ = _by_group(difference.tolist(), groups)
+    if not len(differences_nm):
+        raise InputError("differences", got="none", wanted="one for each scan")
+    sums, _ = _by_group(differences_nm, groups)
     flipped = np.abs(sign_flips(sums.size, seed, exact_scans=EXACT_PAIRED_SCANS) @ sums)
-    return PairedDifference(
-        mean=float(difference.mean()),
-        interval=bootstrap_interval(difference.tolist(), groups=groups, seed=seed),
+    enough = sums.size >= FEWEST_FOR_INTERVAL
+    return OverUnits(
+        count=sums.size,
+        positive=int((sums > 0).sum()),
+        ci95_nm=bootstrap_interval(differences_nm, groups=groups, seed=seed) if enough else None,
         p=float(np.mean(flipped >= abs(sums.sum()) * _ROUNDING)),
-        first_better=int((sums < 0).sum()),
-        second_better=int((sums > 0).sum()),
-        units=sums.size,
+        smallest_p=smallest_flip_p(sums.size),
     )
+
+
+def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
+    """A difference per scan, resampled over the ``prints`` of the scans; None for a single print."""
+    return over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
 
 
 class ByPrint(Record):

@@ -65,7 +65,7 @@ from benchmarks.blind_trials.scoreboard import (
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers
+from litho_data.sharing.workers import Workers
 from litho_data.store import PrintedScan, open_store
 from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
 from litho_data.virtual_fab.knobs import KnobBoard

@@ -15,24 +15,23 @@ from typing import Any
 import pytest
 
 from benchmarks.blind_trials import campaign
-from litho_data.build.build import build_dataset
-from litho_data.foundation import workers as module
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import running_command
-from litho_data.foundation.sending import Known
-from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.making.build import build_dataset
+from litho_data.sharing import workers as module
+from litho_data.sharing.sending import Known
+from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.store import open_store
 from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
 from litho_design.workflows.compare import compare
-from litho_design.workflows.front import efficiency_front
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop.bases import choose_base
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.search import _fitted
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import bare_state, planted, study_of
@@ -112,8 +111,8 @@ def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: P
             yield one
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("litho_data.build.build.run_jobs", and_kill)
-        patched.setattr("litho_data.build.build.write_report", lambda *_: None)
+        patched.setattr("litho_data.making.build.run_jobs", and_kill)
+        patched.setattr("litho_data.making.build.write_report", lambda *_: None)
         result = build_dataset(card, tmp_path / "prints.zarr", dask=address)
     assert killed
     assert result.dataset.sha256 == alone.dataset.sha256
@@ -198,25 +197,6 @@ def test_designs_are_the_same_to_the_bit(
         # Hashes of levels, height, image, target.
         assert one.files == other.files != {}
         assert one.predicted == other.predicted
-
-
-@pytest.mark.long
-def test_a_front_is_the_same_to_the_bit(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    tiny = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 4, "search.polish_rounds": 1}
-    settings = hologram_settings(changes={**tiny, "window.yield_draws": 2, "window.defocus_sd_um": 0.5})
-    here, there = (
-        efficiency_front(
-            "ring", "zoo:physics", name, weights=(0.0, 0.3), settings=settings, announce=False, dask=dask
-        )
-        for name, dask in (("a", None), ("b", address))
-    )
-    assert here.points == there.points
-    for point in here.points:
-        one, other = (Design.read(tmp_path / name / point.folder) for name in "ab")
-        assert one.files == other.files != {}
 
 
 @pytest.mark.long

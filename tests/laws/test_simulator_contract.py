@@ -39,6 +39,7 @@ NARROW = {
     },
     "pbl": {"sigma_diffusion_init_um": 0.3},
     "physics": {"sigma_diffusion_init_um": 0.3},
+    "e-beam": {"forward_um": 0.08, "back_um": 0.2, "diffusion_um": 0.09, "diffusion_max_um": 0.2},
     "fno": {"width": 6, "modes": (4, 4), "projection_channels": 8},
 }
 # Of the default variant alone.
@@ -248,8 +249,9 @@ def test_a_frozen_model_takes_layouts_of_its_own_precision_only(name, tmp_path):
             frozen(layout().to(dtype))
     single, double = frozen(layout()), frozen.double()(layout().double())
     assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
-    # Roundings of 1e-7 of 1 µm, which slopes and layers of these small models amplify some tens of times.
-    assert torch.allclose(single.double(), double, rtol=0, atol=1e-5)
+    # Roundings of 1e-7 of 1 µm, which slopes and layers of these small models amplify some tens of times, and
+    # the edges of e-beam, where they cross flat resist, by one over 5e-3.
+    assert torch.allclose(single.double(), double, rtol=0, atol=1e-4 if name == "e-beam" else 1e-5)
 
 
 @pytest.mark.parametrize(("name", "variant"), [("physics", "paper"), ("physics", "authors")])

@@ -12,11 +12,17 @@ from pathlib import Path
 
 import pytest
 
+from tests.stopped_commands import COMMANDS
+
 ROOT = Path(__file__).parents[2]
+# One of each way to write a folder: a store, parts that grow, a whole folder, a plan from kept tiles, a file.
+QUICK = ("build", "train-network", "freeze", "next-print", "export-design")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")
-@pytest.mark.parametrize("name", ["build", "train-network", "freeze"])
+@pytest.mark.parametrize(
+    "name", [one if one in QUICK else pytest.param(one, marks=pytest.mark.long) for one in COMMANDS]
+)
 def test_a_stopped_command_that_is_given_again_ends_like_one_that_was_not(name: str, tmp_path: Path) -> None:
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     words = [sys.executable, "-m", "tests.stopped_commands", name, str(tmp_path / "place")]

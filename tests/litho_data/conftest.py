@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.build.build import build_dataset
+from litho_data.making.build import build_dataset
 from tests.litho_data.campaigns import write_campaign
 
 

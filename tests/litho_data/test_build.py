@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.build.build import build_dataset
-from litho_data.build.jobs import Skipped, field_jobs, finish
-from litho_data.build.operations import no_recipe
-from litho_data.build.result import BuildResult, report_folder
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
+from litho_data.making.jobs import Skipped, field_jobs, finish
+from litho_data.making.operations import no_recipe
+from litho_data.making.result import BuildResult, report_folder
 from litho_data.provenance.history import read_steps, replay
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store

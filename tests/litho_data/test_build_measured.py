@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.build.build import build_dataset
 from litho_data.cards.fetch import find_card
+from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.schema import SAMPLE_VARIABLES
@@ -19,7 +19,7 @@ from litho_data.store.schema import SAMPLE_VARIABLES
 _BUILD = """
 import json, resource, sys
 from pathlib import Path
-from litho_data.build.build import build_dataset
+from litho_data.making.build import build_dataset
 if __name__ == "__main__":
     result = build_dataset(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
     child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024

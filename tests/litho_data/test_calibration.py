@@ -10,13 +10,13 @@ from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
 from litho_data import build_dataset, open_store, verify
-from litho_data.build.calibration import calibrate
-from litho_data.build.day_tip import tip_of
-from litho_data.build.jobs import field_jobs
-from litho_data.build.operations import no_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
+from litho_data.making.calibration import calibrate
+from litho_data.making.day_tip import tip_of
+from litho_data.making.jobs import field_jobs
+from litho_data.making.operations import no_recipe
 from litho_data.provenance.history import history, replay
 from litho_data.roughness import axis_scales, find_step, find_wave
 from litho_data.tip.radius import peak_radius

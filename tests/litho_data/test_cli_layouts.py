@@ -9,10 +9,10 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 from typer.testing import CliRunner
 
-from litho_data.build.build import build_dataset
 from litho_data.cli.layouts import masks, simulate
-from litho_data.foundation.app import new_app
+from litho_data.commands.app import new_app
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, Truth
 from litho_data.virtual_fab.settings import PRESETS

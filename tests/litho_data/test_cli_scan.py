@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from litho_data.cli.scan import inspect, level
 from litho_data.cli.scan_picture import write_picture
-from litho_data.foundation.app import new_app, run_app
+from litho_data.commands.app import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.level import Recipe

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from litho_data import build_dataset, open_store
-from litho_data.build.gratings import grating_scan, grating_scans
 from litho_data.cards.card import KnownGrating
 from litho_data.foundation.errors import InputError
 from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.random_layout import random_layout
+from litho_data.making.gratings import grating_scan, grating_scans
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
 from litho_data.virtual_fab.jobs import jobs_of_card
 from litho_data.virtual_fab.knobs import KnobBoard

@@ -11,8 +11,8 @@ import zarr
 from scipy.ndimage import gaussian_filter
 
 from litho_data import open_store
-from litho_data.build.build import build_dataset
-from litho_data.build.height_sigma import height_sigma
+from litho_data.making.build import build_dataset
+from litho_data.making.height_sigma import height_sigma
 from litho_data.provenance.history import replay
 from litho_data.register.flows import LADDER, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX

@@ -12,7 +12,6 @@ from litho_data.layouts import (
     PATTERNS,
     LayoutStatistics,
     checkerboard,
-    departure,
     flat,
     framed_ladder,
     isolated_features,
@@ -220,23 +219,6 @@ class TestStatistics:
         found = layout_statistics([random_layout((64, 64), seed=0)], levels=13, pitch_um=0.1)
         found.write(tmp_path)
         assert LayoutStatistics.read(tmp_path) == found
-
-    def test_departure_orders_designs(self):
-        training = layout_statistics(
-            [random_layout((256, 256), seed=s) for s in range(8)], levels=13, pitch_um=0.1
-        )
-        alike = departure(random_layout((256, 256), seed=99), training)
-        finer = departure(random_layout((256, 256), cutoff_per_um=1.0, seed=99), training)
-        binary = departure(
-            np.where(random_layout((256, 256), cutoff_per_um=1.0, seed=9) > 5, 12, 0), training
-        )
-        # 16 windows, 1 % expected outside: three or more by chance has p < 1e-3.
-        assert alike.windows_outside <= 2 / 16
-        assert alike.power_beyond < 0.05
-        assert finer.power_beyond > 0.5
-        assert finer.windows_outside > 0.9
-        assert binary.level_distance > 0.9
-        assert binary.worst_distance > finer.worst_distance > alike.worst_distance
 
     def test_empty_and_foreign_layouts_are_errors(self):
         with pytest.raises(InputError, match="layouts"):

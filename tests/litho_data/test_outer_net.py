@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from litho_data.cards.card import load_card
-from litho_data.foundation.app import new_app, run_app
+from litho_data.commands.app import new_app, run_app
+from litho_data.commands.settings import read_settings
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.names import is_plain_name
 from litho_data.foundation.quantities import DOSE, PITCH_UM
 from litho_data.foundation.results import Result
-from litho_data.foundation.settings import read_settings
 from litho_data.level.recipe import Recipe
 
 
@@ -90,7 +90,7 @@ def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(words: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
-    code = f"from litho_data.foundation.app import *\napp = new_app('t')\n{words}\nrun_app(app, 't')"
+    code = f"from litho_data.commands.app import *\napp = new_app('t')\n{words}\nrun_app(app, 't')"
     command = [sys.executable, "-c", code, "say"]
     return subprocess.run(command, capture_output=True, env={**os.environ, **environment}, timeout=60)
 
@@ -105,7 +105,7 @@ def test_a_terminal_without_a_micro_sign_gets_another_letter() -> None:
 
 
 def test_a_reader_that_has_had_enough_is_no_error() -> None:
-    code = "from litho_data.foundation.app import *\napp = new_app('t')\n"
+    code = "from litho_data.commands.app import *\napp = new_app('t')\n"
     code += SAY.format(times=100_000) + "\nrun_app(app, 't')"
     with subprocess.Popen(
         [sys.executable, "-c", code, "say"], stdout=subprocess.PIPE, stderr=subprocess.PIPE

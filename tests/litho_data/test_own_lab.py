@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from litho_data.build.build import build_dataset
-from litho_data.build.suggest import RECIPES, left_by_layout, suggest_recipe
 from litho_data.cards.card import load_card
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe
+from litho_data.making.build import build_dataset
+from litho_data.making.suggest import RECIPES, left_by_layout, suggest_recipe
 from litho_data.register.refine import interior_of
 from litho_data.store import open_store
 from tests.litho_data.campaigns import write_campaign
@@ -131,7 +131,7 @@ def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "[process]\nregistration = 'affine'\n", BOW])
 def test_a_suggested_card_says_the_rest_as_before(tmp_path: Path, text: str) -> None:
-    from litho_data.build.suggest import _write_card
+    from litho_data.making.suggest import _write_card
 
     card = tmp_path / "card.toml"
     card.write_text(

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from litho_data.build.build import build_dataset
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.readers import Reader, formats, read_scan, register_reader, registry
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign

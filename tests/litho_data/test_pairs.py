@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.build.build import build_dataset
 from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.partial import PartialStore, Piece

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from litho_data.build.build import build_dataset
 from litho_data.exchange.release import export_zip
 from litho_data.level import layout_in_scan_frame
+from litho_data.making.build import build_dataset
 from litho_data.provenance.history import read_steps, replay
 from litho_data.provenance.verify import verify
 from litho_data.register import Bend, Registration, apply_transform, register_scan, resample_to_layout

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from litho_data.build.build import build_dataset
+from litho_data.making.build import build_dataset
 from litho_data.provenance.history import replay
 from litho_data.provenance.verify import verify
 from litho_data.register import apply_transform

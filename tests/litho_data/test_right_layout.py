@@ -11,9 +11,9 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter
 
-from litho_data.build import right_layout
-from litho_data.build.build import build_dataset
-from litho_data.build.right_layout import doubts, prints_of
+from litho_data.making import right_layout
+from litho_data.making.build import build_dataset
+from litho_data.making.right_layout import doubts, prints_of
 from litho_data.register.topography import pearson
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, height_of, layout_of, write_campaign

@@ -9,13 +9,11 @@ from litho_data.foundation.errors import InputError
 from litho_data.roughness import (
     amplitude_parameters,
     autocorrelation,
-    correlation_length_um,
     effective_samples,
     exponential_correlation,
     gaussian_correlation,
     groove_depth,
     psd_along,
-    psd_radial,
     retained_variance,
     retained_variance_by_rows,
     sq_uncertainty_nm,
@@ -100,37 +98,12 @@ class TestSpectra:
         # 100 bins together to 1 %.
         assert spectrum.density[10:110].mean() == pytest.approx(2 * 4 * PITCH_UM, rel=0.03)
 
-    @pytest.mark.parametrize(("window", "tolerance"), [(False, 0.08), (True, 0.16)])
-    def test_radial_spectrum_of_a_known_surface(self, window, tolerance):
-        surfaces = [gaussian_surface((256, 256), 1.0, seed) for seed in range(10)]
-        spectra = [psd_radial(surface, PITCH_UM, window=window) for surface in surfaces]
-        frequency = spectra[0].frequency_per_um
-        # Closed form for autocorrelation exp(−r²/T²), T = 1 µm: σ² π T² exp(−(πTf)²).
-        expected = 100 * np.pi * np.exp(-((np.pi * frequency) ** 2))
-        band = (frequency > 0.1) & (frequency < 0.5)
-        ratio = np.mean([spectrum.density for spectrum in spectra], axis=0)[band] / expected[band]
-        # About 1,300/2 independent bins in the band for ten surfaces (4 %), a quarter of that windowed.
-        assert ratio.mean() == pytest.approx(1, abs=tolerance)
-
     def test_nan_is_an_error(self):
         with pytest.raises(InputError, match="NaN"):
             psd_along(np.full((9, 9), np.nan), PITCH_UM, "x")
 
 
 class TestCorrelation:
-    def test_length_of_a_known_surface(self):
-        lengths = [
-            correlation_length_um(gaussian_surface((512, 512), 0.8, seed), PITCH_UM, "x") for seed in range(3)
-        ]
-        # About 51.2²/(π·0.64/2) = 2600 independent spots: a per cent or two of scatter.
-        assert np.mean(lengths) == pytest.approx(0.8, rel=0.04)
-
-    def test_axes_are_told_apart(self):
-        stretched = gaussian_surface((256, 512), 0.8, 1)[:, ::2]
-        along_x = correlation_length_um(stretched, PITCH_UM, "x")
-        along_y = correlation_length_um(stretched, PITCH_UM, "y")
-        assert along_y / along_x == pytest.approx(2, rel=0.15)
-
     def test_cosine_is_its_own_autocorrelation(self):
         x = np.arange(400)
         correlation = autocorrelation(np.cos(2 * np.pi * x / 40)[None, :].repeat(8, 0))

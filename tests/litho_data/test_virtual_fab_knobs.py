@@ -172,22 +172,15 @@ class TestStrengthForRms:
         highest = KNOBS["line-roughness"].limit
         assert strength_for_rms("line-roughness", 2 * highest, jobs=jobs).rms_nm == highest
 
-    def test_knobs_within_the_nuisance_span_are_refused_under_full(self, jobs):
+    def test_knobs_within_the_nuisance_span_are_refused(self, jobs):
         for name in ("tilt-bow", "z-gain", "vertical-shrinkage", "datum-offset"):
             with pytest.raises(InputError, match="no trace"):
                 strength_for_rms(name, 5.0, jobs=jobs)
-        assert strength_for_rms("tilt-bow", 5.0, jobs=jobs, policy="offset").rms_nm == pytest.approx(
-            5, rel=0.0101
-        )
 
     def test_bad_wishes_are_errors(self, jobs):
-        for name, rms_nm, policy in (
-            ("nosuch", 5.0, "full"),
-            ("vignetting", 0.0, "full"),
-            ("vignetting", 5.0, "rows"),
-        ):
+        for name, rms_nm in (("nosuch", 5.0), ("vignetting", 0.0)):
             with pytest.raises(InputError):
-                strength_for_rms(name, rms_nm, jobs=jobs, policy=policy)
+                strength_for_rms(name, rms_nm, jobs=jobs)
 
 
 class TestSignatures:

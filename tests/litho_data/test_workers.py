@@ -19,12 +19,12 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.build.build import build_dataset
-from litho_data.foundation import workers as module
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import running_command
-from litho_data.foundation.sending import Known, sent
-from litho_data.foundation.workers import Workers, _windowed, run_jobs
+from litho_data.making.build import build_dataset
+from litho_data.sharing import workers as module
+from litho_data.sharing.sending import Known, sent
+from litho_data.sharing.workers import Workers, _windowed, run_jobs
 from litho_data.store import open_store
 from litho_data.store.partial import PartialStore
 from tests.jobs import die_at_first, large, refuse, told

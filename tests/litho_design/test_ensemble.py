@@ -58,11 +58,17 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
 
     apart = {}
     for weight in (0.0, 20.0):
-        ensemble = small_settings.ensemble.model_copy(update={"weight": weight})
+        ensemble = small_settings.ensemble.model_copy(update={"weight": weight, "risk": "mean"})
         settings = small_settings.model_copy(update={"ensemble": ensemble})
         main, other = models()
         design = design_hologram(
-            target, main, tmp_path / f"{weight:g}", settings=settings, ensemble=[other], announce=False
+            target,
+            main,
+            tmp_path / f"{weight:g}",
+            settings=settings,
+            judges=[other],
+            robust=True,
+            announce=False,
         )
         assert [member.name for member in design.ensemble.members] == ["wide"]
         assert Design.read(tmp_path / f"{weight:g}") == design
@@ -98,10 +104,11 @@ def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
         }
     )
     other = make_printer(layout, sigma_um=0.3, name="wide")
-    design = design_lens(make_printer(layout), tmp_path, settings=settings, ensemble=[other], announce=False)
+    design = design_lens(
+        make_printer(layout), tmp_path, settings=settings, judges=[other], robust=True, announce=False
+    )
     assert design.ensemble is not None
     assert design.ensemble.disagreement_nm > 0
-    assert (tmp_path / "focus_window.csv").exists()
     assert (tmp_path / "window.csv").exists()
 
 

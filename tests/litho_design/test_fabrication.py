@@ -84,8 +84,7 @@ def test_what_is_unusual_is_said():
     assert found.flagged
 
 
-def test_a_flagged_design_says_what_staying_inside_costs(tmp_path):
-    """And a search that stays inside from the start is closer."""
+def test_a_flagged_design_says_so_and_a_search_that_stays_inside_is_closer(tmp_path):
     changes = {
         "layout.size_px": 64,
         "optics.distance_um": 8,
@@ -103,15 +102,9 @@ def test_a_flagged_design_says_what_staying_inside_costs(tmp_path):
     free = designed("free")
     gauge = free.out_of_distribution
     assert gauge.flagged
-    # The limit is 0.2: staying inside takes a tenth off the distance at least.
-    assert gauge.inside_distance < 0.9 * gauge.level_distance
-    said = distribution_warning(free)
-    cost = free.predicted["si_psnr_db"] - gauge.inside["si_psnr_db"]
-    assert "steps of" in said
-    # So near the limit it may cost nothing.
-    assert f"{abs(cost):.2f} dB {'less' if cost >= 0 else 'more'} scale-invariant PSNR" in said
+    assert "steps of" in distribution_warning(free)
     kept = designed("kept", **{"fabrication.inside_weight": 0.5})
     assert not kept.out_of_distribution.flagged
-    assert kept.out_of_distribution.inside is None
+    assert kept.out_of_distribution.level_distance < gauge.level_distance
     with pytest.raises(InputError, match="other settings"):
         designed("free", **{"fabrication.min_feature_um": 0.8})

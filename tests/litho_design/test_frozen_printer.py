@@ -13,13 +13,14 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
+from litho_design import design_hologram, hologram_settings, score
 from litho_design.cli.app import app, main
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.source import load_printer
 from litho_design.printers.training import OutOfDistribution
-from litho_design.reports.advice import distribution_warning, stroke_advice
+from litho_design.reports.advice import distribution_warning, spread_sentence, stroke_advice
 from litho_design.tasks.design import Design
-from litho_models import save_frozen
+from litho_models import save_frozen, zoo
 from litho_models.models import model_class
 
 SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20", "--yield-draws", "5")
@@ -139,15 +140,38 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     # Layout, print and images; the search; the yield.
     assert (design / "report.html").read_text("utf-8").count("data:image/svg+xml;base64,") == 3
     call("score", design, "--judge", "none", "--judge", f"twin={affine_folder}", "--out", tmp_path / "score")
-    score = json.loads((tmp_path / "score" / "score.json").read_text())
-    scores = score["scores"]
+    judged = json.loads((tmp_path / "score" / "score.json").read_text())
+    scores = judged["scores"]
     assert [(s["judge"]["name"], s["independent"]) for s in scores] == [("none", True), ("twin", False)]
     models = f"none,affine={affine_folder}"
     call("compare", "--models", models, "--target", "ring", "--seeds", "1", "--out", tmp_path / "gap", *SMALL)
     gap = json.loads((tmp_path / "gap" / "gap.json").read_text())
     assert gap["schema"] == "litho-design/gap/1"
     assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
-    assert {record.run.commit, score["commit"], gap["commit"]} == {run_facts()["commit"]}
+    assert {record.run.commit, judged["commit"], gap["commit"]} == {run_facts()["commit"]}
+
+
+def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path):
+    """And says how far they are apart: as stated, in the median and at worst."""
+    changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
+    few = {"search.polish_rounds": 0, "window.yield_draws": 2, "window.defocus_sd_um": 0.5}
+    settings = hologram_settings(changes=changes | few)
+    known = {"judges": (), "announce": False}
+    design = design_hologram("ring", "zoo:physics", tmp_path / "design", settings=settings, **known)
+    result = score(tmp_path / "design", tmp_path / "score")
+    others = [one for one in zoo.list() if one != "physics"]
+    assert [one.judge.source for one in result.scores] == [f"{zoo.PREFIX}{one}" for one in others]
+    assert all(one.independent for one in result.scores)
+    values = [design.predicted["si_psnr_db"], *(one.figures["si_psnr_db"] for one in result.scores)]
+    page = (tmp_path / "score" / "report.html").read_text("utf-8")
+    assert f"{np.median(values):.3g} in the median, {min(values):.3g} at worst" in page
+    said = spread_sentence("si_psnr_db", {"own": 20.0, "other": 18.0, "third": 18.5}, False, 1.5)
+    assert "18.5 in the median, 18 at worst, by other. They disagree by 2 dB, more than the 1.5" in said
+    assert "disagree" not in spread_sentence("rms_nm", {"own": 4.0, "other": 6.0}, True, 3.0)
+    alone = design_hologram("ring", "none", tmp_path / "none", settings=settings, **known)
+    assert alone.printer.dataset_sha256 == ""
+    with pytest.raises(InputError, match="nothing to judge with"):
+        score(tmp_path / "none", tmp_path / "empty")
 
 
 @pytest.mark.parametrize(
@@ -253,7 +277,7 @@ def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, 
         (("hoe", "--model", "none", "--start", "fresnel", "--size-px", "64", "--out", "out"), "'fresnel'"),
         (("hoe", "--model", "none", "--risk-tail", "0", "--out", "out"), "tail"),
         (("hoe", "--model", "none", "--spread-of", "no.zarr", "--out", "out"), "no.zarr"),
-        (("hoe", "--model", "none", "--ensemble", "b=nowhere", "--out", "out"), "nowhere"),
+        (("hoe", "--model", "none", "--judge", "b=nowhere", "--out", "out"), "nowhere"),
         (("lens", "--model", "none", "--focal-length-um", "0.02", "--out", "out"), "propagation distance"),
         (("hoe", "--model", "none", "--device", "abacus", "--out", "out"), "'abacus'"),
         (("hoe", "--model", "none", "--device", "cuda:99", "--out", "out"), "'cuda:99'"),

@@ -18,7 +18,7 @@ from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import Workers
+from litho_data.sharing.workers import Workers
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
@@ -32,7 +32,7 @@ TINY = Effort.small(64)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRINT_KNOBS)
 def test_every_hidden_effect_is_ten_nanometres(name):
-    rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0), policy="full")
+    rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0))
     # Strengths are stated with three digits and were searched to 1 %.
     assert rms == pytest.approx(10.0, rel=0.02)
 

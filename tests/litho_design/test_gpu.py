@@ -76,7 +76,13 @@ def test_a_hologram_is_designed_and_scores_the_same(
     printer = make_printer(settings.layout).to(GPU)
     other = make_printer(settings.layout, sigma_um=0.3, name="wide").to(GPU)
     design = design_hologram(
-        load_target("ring", 128), printer, tmp_path / "d", settings=settings, ensemble=[other], announce=False
+        load_target("ring", 128),
+        printer,
+        tmp_path / "d",
+        settings=settings,
+        judges=[other],
+        robust=True,
+        announce=False,
     )
     assert design.run.device.startswith(GPU)
     assert design.polished_loss < design.start_loss

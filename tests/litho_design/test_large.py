@@ -1,9 +1,7 @@
-"""Large elements: bands of rows give what one piece gives, on any number of processes and from disk."""
+"""Large elements: bands of rows give what one piece gives, on any number of processes."""
 
 from __future__ import annotations
 
-import json
-import math
 import multiprocessing
 import socket
 from pathlib import Path
@@ -13,20 +11,17 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design.cli.app import main
 from litho_design.exports.files import export, import_levels
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import load_design
 from litho_design.large.bands import Bands, Ranks
-from litho_design.large.cost import MeasuredSize, fit_cost, sent_gib
 from litho_design.large.hologram import BandedHologram
 from litho_design.large.lens import RingLens
 from litho_design.large.propagator import BandedPropagator
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, centred_grid, make_propagator
-from litho_design.optics.sampling import fast_length
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.stitching import Stitching, in_fields
@@ -145,28 +140,27 @@ def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alon
     np.testing.assert_array_equal(*layouts)
 
 
-def test_a_score_from_disk_is_that_of_the_whole(alone, tmp_path):
+def test_a_score_in_bands_is_that_of_the_whole(alone, tmp_path):
     design, printer = alone / "design", large_rank.printer()
-    (streamed,) = score(design, tmp_path / "disk", judges=[printer], band_px=48).scores
+    (streamed,) = score(design, tmp_path / "bands", judges=[printer], band_px=48).scores
     (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
     assert len(streamed.figures) == 10
     for name, value in streamed.figures.items():
         # Waves differ by rounding, 1e-6 of the largest amplitude; figures are sums of squares of them.
         assert value == pytest.approx(whole.figures[name], rel=1e-4, abs=1e-7), name
     assert streamed.rms_height_difference_um == pytest.approx(whole.rms_height_difference_um, abs=1e-7)
-    assert not list((tmp_path / "disk").glob(".large-*"))
     # The record of the design has the same figures, but for the zero order.
     predicted = Design.read(design).predicted
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
 
-def test_displaced_write_fields_are_judged_alike_in_memory_and_from_disk(alone, tmp_path):
+def test_displaced_write_fields_are_judged_alike_in_one_piece_and_in_bands(alone, tmp_path):
     design, printer, stitch = alone / "design", large_rank.printer(), Stitching(field_um=4.0, sigma_um=0.15)
     loaded = load_design(design)
     plain = loaded.printed_um(printer)
     moved = in_fields(plain, 0.1, 40, stitch.offsets_um(SIZE, 0.1, [0]))
     wanted = loaded.score(moved).model_dump()
-    folders = (tmp_path / "disk", tmp_path / "whole")
+    folders = (tmp_path / "bands", tmp_path / "whole")
     (streamed,) = score(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
     for name, value in streamed.figures.items():
         # As without fields: rounding of waves, in figures that are sums of squares of them.
@@ -193,61 +187,6 @@ def test_what_a_large_element_cannot_have_is_refused():
     printer.simulator.reach_um = None
     with pytest.raises(InputError, match="depends on the whole image"):
         BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4))
-
-
-def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
-    """On sizes whose cost is known: the model meets them, and the one that it was not fitted to."""
-
-    def known(size):
-        operations = fast_length(2 * size - 1) ** 2 * math.log2(fast_length(2 * size - 1))
-        transforms = 3e-9 * operations
-        return MeasuredSize(
-            size_px=size, iteration_s=transforms + 2e-6 * size**2, transforms_s=transforms,
-            evaluation_s=transforms / 2 + 1e-6 * size**2, peak_memory_gib=0.5 + 64 * size**2 / 2**30,
-        )  # fmt: skip
-
-    cost, unused = fit_cost([known(1024), known(512)]), known(4096)
-    assert cost.iteration_s(4096) == pytest.approx(unused.iteration_s)
-    assert cost.evaluation_s(4096) == pytest.approx(unused.evaluation_s)
-    assert cost.memory_of_rank_gib(4096) == pytest.approx(unused.peak_memory_gib)
-    assert cost.iteration_s(4096, 4) == pytest.approx(unused.iteration_s / 4)
-    # Two processes hold half of the rows, 8,192 complex64 wide, and send half of them, four times.
-    assert sent_gib(4096, 2) == pytest.approx(4 * 2048 * fast_length(8191) * 8 / 2 / 2**30)
-    given = [
-        "--model",
-        "none",
-        "--size-px",
-        "2048",
-        "--measure-px",
-        "64,128",
-        "--ranks",
-        "2",
-        "--band-px",
-        "64",
-    ]
-    monkeypatch.setattr("sys.argv", ["litho-design", "estimate", *given])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 0
-    first, second, told, shared = capsys.readouterr().out.splitlines()
-    assert "64 px" in first
-    assert "128 px" in second
-    assert "2048 px (0.205 mm), 300 iterations" in told
-    assert "0.0625 GiB per iteration" in shared
-
-
-@pytest.mark.parametrize("name", ["physics", "pbl"])
-def test_the_model_of_the_cost_meets_the_size_left_out(name):
-    file = Path(__file__).parents[2] / "docs" / "results" / "large" / f"{name}.json"
-    record = json.loads(file.read_text(encoding="utf-8"))
-    *fitted, unused = [MeasuredSize.model_validate(one) for one in record["measured"]]
-    cost, size = fit_cost(fitted), unused.size_px
-    for predicted, found in (
-        (cost.iteration_s(size), unused.iteration_s),
-        (cost.evaluation_s(size), unused.evaluation_s),
-        (cost.memory_of_rank_gib(size), unused.peak_memory_gib),
-    ):
-        assert predicted == pytest.approx(found, rel=0.25)
 
 
 def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):

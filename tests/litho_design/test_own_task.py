@@ -128,7 +128,9 @@ def test_search_improves_an_own_loss_and_resumes_only_the_same_task(tmp_path):
 def test_robust_and_ensemble_losses_serve_an_own_task(tmp_path, make_printer):
     settings = design_settings(TINY | {"search.iterations": 2, "window.samples": 2, "window.gain_sd": 0.05})
     printers = [make_printer(settings.layout), make_printer(settings.layout, sigma_um=0.3, name="other")]
-    made = design(Corner, printers[0], tmp_path, settings=settings, ensemble=printers[1:], announce=False)
+    made = design(
+        Corner, printers[0], tmp_path, settings=settings, judges=printers[1:], robust=True, announce=False
+    )
     assert made.ensemble.disagreement_nm > 0
     task = Corner(settings, printers[0], ensemble=printers[1:])
     level = torch.from_numpy(load_design(tmp_path).level.numpy())[None, None].float()

@@ -14,8 +14,8 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from litho_data.commands.settings import Leaf, changed, leaves
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.settings import Leaf, changed, leaves
 from litho_design.cli.app import app
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask

@@ -12,9 +12,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_models import load_frozen, save_frozen
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.fit_cache import fit_or_load
+from litho_models.evaluation.results import compare
 from litho_models.fitting import TrainingConfig
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
@@ -174,13 +174,3 @@ def test_a_card_without_one_or_of_another_field_size_adds_none_and_says_so(store
         save_frozen(build_model("identity"), tmp_path / name, **fields)
         scored: Result = evaluate(tmp_path / name, store, tmp_path / f"{name}-out")
         assert scored.nuisance.background == "none"
-
-
-def test_a_cache_of_before_is_completed_without_changing_a_figure(result, store):
-    record, out = result
-    for file in (out / "cache").glob("*/diagnostics.json"):
-        file.unlink()
-    again = benchmark(store, out, models=("identity", "affine"), folds=2)
-    assert again.scores == record.scores
-    for new, old in zip(again.fits, record.fits, strict=True):
-        assert new.diagnostics.background == old.diagnostics.background

@@ -27,7 +27,7 @@ from litho_models.loop.run import close_loop
 from litho_models.loop.search import search
 from litho_models.models import build_model
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from litho_models.simulator import Simulator
 from tests.litho_models.loop_scans import (
     LEVEL_HEIGHT_UM,

@@ -10,22 +10,23 @@ import pandas as pd
 import pytest
 import zarr
 
-from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
+from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.schema import DatasetId
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
-from litho_models.evaluation.results import Benchmark, Evaluation
-from litho_models.fitting.runs import TrainingRun, train
+from litho_models.evaluation.fit_cache import expected, fit_or_load
+from litho_models.evaluation.results import Benchmark, Evaluation, compare
+from litho_models.fitting.runs import TrainingRun, train, training_config
 from litho_models.frozen.freezing import freeze
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.splits.folds import plan_folds
 from tests.litho_models.prints import make_scans, write_store
+from tests.tables import require_tables_equal_record
 
 MODELS = ("identity", "affine", "linear")
 SETTINGS = {"nuisance": "offset"}
@@ -77,11 +78,18 @@ def test_the_result_is_complete_on_disk(result):
     floor = f"noise floor ({record.noise_floor.kind.replace('-', ' ')})"
     assert list(table.index) == [*MODELS, floor]
     assert table.loc[floor, "mae_datum_free_nm"] == pytest.approx(record.noise_floor.mae_nm)
-    scans = pd.read_csv(out / "scans.csv")
+    require_tables_equal_record(
+        out,
+        Benchmark.FILE_NAME,
+        {name: {"above_floor_nm": ""} for name in ("benchmark.csv", "lock_box.csv")},
+        pivoted=("policies.csv",),
+    )
+    policies = pd.read_csv(out / "policies.csv").set_index(["model", "background"])
     for scores in record.scores:
-        assert table.loc[scores.model, "mae_datum_free_nm"] == pytest.approx(scores.mae_datum_free_nm)
-        own = scans[scans["model"] == scores.model].set_index("scan")["mae_datum_free_nm"]
-        assert own.to_dict() == pytest.approx({row.scan: row.mae_datum_free_nm for row in scores.scans})
+        for background, errors in (("none", scores.without_background), ("training", scores.by_policy)):
+            for error in errors or ():
+                found = policies.loc[(scores.model, background), f"{error.policy}_mae_nm"]
+                assert found == pytest.approx(error.mae_nm)
     assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "metrics.csv"} <= {
         p.name for p in out.iterdir()
     }
@@ -137,6 +145,21 @@ def test_quadrants_of_the_paper_split_are_disjoint_and_leaky():
     assert not held_out & training
     assert {part_id.split("/")[0] for part_id in held_out} & {part_id.split("/")[0] for part_id in training}
     assert all(part.shape == (32, 32) for part in fold.held_out)
+
+
+@pytest.mark.parametrize("background", ["training", "shared"])
+@pytest.mark.parametrize("model", ["affine", "linear", "blur-table"])
+def test_no_height_of_a_held_out_scan_moves_what_a_fit_expects_of_it(model, background, tmp_path):
+    fold = plan_folds(make_scans(4, 48), [], "grouped", folds=2)[0]
+    other = [replace(scan, height_um=scan.height_um + 0.3 * scan.layout_um**2) for scan in fold.held_out]
+    config = training_config("fast", model, SETTINGS)
+    maps = []
+    for number, held_out in enumerate((fold.held_out, other)):
+        own = replace(fold, held_out=held_out)
+        record, heights = fit_or_load(model, own, config, tmp_path / f"{number}", background == "shared")
+        pairs = zip(held_out, heights, strict=True)
+        maps.append([expected(record, background, scan, height).map_um for scan, height in pairs])
+    np.testing.assert_array_equal(maps[0], maps[1])
 
 
 def test_whole_prints_are_held_out_by_print():

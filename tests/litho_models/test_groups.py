@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from litho_data.store import PrintedScan, open_store
-from litho_models.scan_terms.groups import ALL, groupings, label_of
+from litho_models.scan_terms.grouped import ALL, groupings, label_of
 from tests.litho_models.loop_scans import blank_scan
 from tests.litho_models.prints import make_scans, write_store
 

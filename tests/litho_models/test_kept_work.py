@@ -144,7 +144,6 @@ def test_a_damaged_fit_is_told_with_its_folder(scored, store, tmp_path):
     folder = next(path for path in (out / "cache").glob("affine-*"))
     for name, damage in (
         ("fit.json", cut_short),
-        ("diagnostics.json", cut_short),
         ("prediction_000.npy", cut_short),
         ("prediction_000.npy", emptied),
         ("prediction_000.npy", Path.unlink),

@@ -14,7 +14,7 @@ from litho_models.loop.checking import FORM_SHARE, Check
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import judge
 from litho_models.loop.search import Cause
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 

@@ -14,7 +14,7 @@ from litho_models.loop.model import Slot, Twin, Values
 from litho_models.loop.prepared import LARGE_PX, prepare_scans
 from litho_models.loop.results import clustered_covariance, confounded
 from litho_models.models import build_model
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import (
     BLUR_UM,
     PITCH_UM,

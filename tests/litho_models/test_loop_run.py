@@ -17,7 +17,7 @@ import tifffile
 import litho_data
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, open_store
-from litho_data.store.lock_box import lock_box, locked_ids
+from litho_data.store.lock_box import locked_ids
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
@@ -34,7 +34,8 @@ from litho_models.loop.results import _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, dealt
 from litho_models.loop.saving import save_model
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.statistics import over_units
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
 
@@ -115,6 +116,7 @@ def test_errors_are_means_over_the_scans_that_took_part(closed, store: Path) -> 
     assert after is not None
     gains = [before.by_scan_nm[one] - after.by_scan_nm[one] for one in before.by_scan_nm]
     assert result.gain_nm == pytest.approx(np.mean(gains))
+    assert result.over_scans == over_units(gains, seed=0)
     assert result.error("all", held_out="locked") is not None
     assert result.error("causes", "none", "published") is None
 
@@ -158,6 +160,8 @@ def _same_columns(table: pd.DataFrame, rows: list[dict[str, object]]) -> None:
             wanted = row[str(column)]
             if isinstance(wanted, float):
                 assert found == pytest.approx(wanted, rel=1e-12), column
+            elif isinstance(wanted, tuple):
+                assert found == " … ".join(f"{end:.2f}" for end in wanted), column
             elif wanted is None or wanted == "":
                 assert pd.isna(found), column
             else:
@@ -355,8 +359,6 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
 ) -> None:
     scans = make_scans(6, 48)
     locked = locked_ids(scans)
-    # Drawn with this seed, or from the scans that are left, the box would be another.
-    assert lock_box([s.id for s in scans], [s.print_id for s in scans], 1, seed=2) != locked
     # Hardly any pixel of the locked scan is measured, so it is dropped.
     corner = np.zeros(scans[0].shape, bool)
     corner[:4, :4] = True
@@ -410,6 +412,17 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     # White noise of 4 nm: E|n| = 0.8 sd.
     assert after.mae_nm == pytest.approx(4 * np.sqrt(2 / np.pi), rel=0.1)
     assert after.mae_nm < 0.8 * before.mae_nm
+
+
+@pytest.mark.parametrize(
+    "other", [{"seed": 1}, {"folds": 3}, {"open_lock_box": False}, {"decided_by": ["0" * 64]}], ids=str
+)
+def test_a_loop_of_other_settings_or_further_prints_is_not_replaced(
+    closed, store: Path, other: dict[str, Any]
+) -> None:
+    settings = {"base": BASE, "folds": 2, "open_lock_box": True} | other
+    with pytest.raises(InputError, match="a result with other settings"):
+        close_loop(store, closed[1], **settings)
 
 
 def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -> None:

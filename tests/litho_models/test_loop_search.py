@@ -13,7 +13,7 @@ from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
 from litho_models.loop.model import Twin, Values
 from litho_models.loop.search import Found, same_change, search, separating, untestable
 from litho_models.models import build_model
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 CANDIDATES = [

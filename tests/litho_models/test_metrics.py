@@ -7,15 +7,21 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.errors import InputError
-from litho_models.scoring.metrics import print_gain, score_scan
-from litho_models.scoring.statistics import bootstrap_interval, paired_difference, smallest_flip_p
+from litho_models.scan_terms import POLICIES, cross_fit
+from litho_models.scoring.metrics import print_gain, scan_errors
+from litho_models.scoring.statistics import bootstrap_interval, over_units, smallest_flip_p
 
 VALID = np.ones((256, 256), bool)
 
 
+def scored(height, prediction, policy="offset"):
+    free = cross_fit(height, prediction, np.isfinite(height), POLICIES[policy])
+    return scan_errors("a", height, prediction, free)
+
+
 def test_constant_error_is_bias_and_vanishes_when_the_datum_is_free():
     prediction = np.random.default_rng(0).uniform(0, 1, VALID.shape)
-    score = score_scan("a", prediction - 0.052, prediction, VALID)
+    score = scored(prediction - 0.052, prediction)
     # Measured minus predicted: a print lower than the model says has a negative bias.
     assert score.bias_nm == pytest.approx(-52)
     assert score.mae_abs_nm == pytest.approx(52)
@@ -25,7 +31,7 @@ def test_constant_error_is_bias_and_vanishes_when_the_datum_is_free():
 def test_gaussian_noise_has_a_mean_absolute_error_of_0_798_sigma():
     random = np.random.default_rng(1)
     noise = random.normal(0, 0.01596, VALID.shape)
-    score = score_scan("a", noise, np.zeros(VALID.shape), VALID, "none")
+    score = scored(noise, np.zeros(VALID.shape), "none")
     # 65,536 pixels: |n| has a relative standard error of 0.756/256 = 0.3 %; three times that.
     assert score.mae_datum_free_nm == pytest.approx(15.96 * np.sqrt(2 / np.pi), rel=0.009)
     assert score.rmse_datum_free_nm == pytest.approx(15.96, rel=0.009)
@@ -36,11 +42,11 @@ def test_gaussian_noise_has_a_mean_absolute_error_of_0_798_sigma():
 def test_gain_and_offset_of_a_known_line():
     x = np.linspace(0, 1.2, VALID.size).reshape(VALID.shape)
     line = print_gain(0.7 * x + 0.05, x, VALID)
-    assert (line.slope, line.intercept_um) == (pytest.approx(0.7), pytest.approx(0.05))
-    assert max(line.slope_error, line.intercept_error_um) < 1e-12
+    assert (line.slope, line.intercept_nm) == (pytest.approx(0.7), pytest.approx(50))
+    assert max(line.slope_error, line.intercept_error_nm / 1000) < 1e-12
     flat = print_gain(x, np.ones(VALID.shape), VALID)
     assert np.isnan(flat.slope)
-    assert flat.intercept_um == pytest.approx(0.6)
+    assert flat.intercept_nm == pytest.approx(600)
 
 
 def test_the_covariance_of_gain_and_offset_is_that_of_repeated_prints():
@@ -52,13 +58,13 @@ def test_the_covariance_of_gain_and_offset_is_that_of_repeated_prints():
         noise = 0.1 * gaussian_filter(random.normal(size=VALID.shape), 3) * (0.5 + prediction)
         found.append(print_gain(0.9 * prediction + 0.03 + noise, prediction, VALID))
     slopes, offsets = (
-        np.array([getattr(line, name) for line in found]) for name in ("slope", "intercept_um")
+        np.array([getattr(line, name) for line in found]) for name in ("slope", "intercept_nm")
     )
     # 300 repeats know a standard deviation to 4 %; 64 blocks know theirs to 9 % each time, and lose a few
     # per cent of it to what neighbouring blocks share.
     assert np.mean([line.slope_error for line in found]) == pytest.approx(slopes.std(), rel=0.15)
-    assert np.mean([line.intercept_error_um for line in found]) == pytest.approx(offsets.std(), rel=0.15)
-    correlations = [line.correlation for line in found]
+    assert np.mean([line.intercept_error_nm for line in found]) == pytest.approx(offsets.std(), rel=0.15)
+    correlations = [line.slope_intercept_correlation for line in found]
     assert np.mean(correlations) == pytest.approx(np.corrcoef(slopes, offsets)[0, 1], abs=0.1)
     # Taken for independent, the same pixels would promise several times too much.
     naive = noise.std() / (prediction.std() * np.sqrt(VALID.size))
@@ -80,26 +86,21 @@ def test_one_scan_has_no_interval():
 
 
 def test_sign_flip_p_of_a_uniform_improvement_is_two_in_two_to_the_n():
-    first, second = [20.0] * 6, [21.0] * 6
-    compared = paired_difference(first, second)
+    compared = over_units([-1.0] * 6)
     assert compared.p == pytest.approx(2 / 2**6)
-    assert compared.mean == -1.0
-    assert compared.first_better == 6
+    assert (compared.count, compared.positive) == (6, 0)
 
 
 def test_prints_are_resampled_and_flipped_whole():
     prints, scans_of_each = 6, 4
     groups = [print_ for print_ in "abcdef" for _ in range(scans_of_each)]
-    better = paired_difference([20.0] * len(groups), [21.0] * len(groups), groups=groups)
-    assert (better.units, better.first_better) == (prints, prints)
+    better = over_units([1.0] * len(groups), groups)
+    assert (better.count, better.positive) == (prints, prints)
     # Twenty-four scans that agree, and yet no smaller p than six prints can have.
     assert better.p == smallest_flip_p(prints) == 1 / 32
     # Groups of one scan are the scans themselves.
     values = np.random.default_rng(5).normal(size=8).tolist()
-    alone, grouped = (
-        paired_difference(values, [0.0] * 8, groups=groups) for groups in (None, list("abcdefgh"))
-    )
-    assert alone == grouped
+    assert over_units(values) == over_units(values, list("abcdefgh"))
     # What differs from print to print only is as uncertain as the mean of the prints: sd / sqrt(6) each way,
     # against sd / sqrt(24) if its scans counted as independent. Percentiles of 6 values: within a third.
     shifts = np.random.default_rng(6).normal(size=prints)
@@ -114,19 +115,17 @@ def test_prints_of_unequal_size_count_by_their_scans():
     # Three scans at 0, one at 4: the mean over scans is 1, over prints it would be 2; no draw leaves 0 ... 4.
     low, high = bootstrap_interval([0.0, 0.0, 0.0, 4.0], groups=list("aaab"))
     assert (low, high) == (0.0, 4.0)
-    found = paired_difference([0.0, 0.0, 0.0, 4.0], [0.0] * 4, groups=list("aaab"))
-    assert found.mean == 1.0
 
 
 def test_no_difference_gives_p_of_one():
-    assert paired_difference([1.0, 2.0], [1.0, 2.0]).p == 1.0
+    assert over_units([0.0, 0.0]).p == 1.0
 
 
 def test_sampled_and_exact_p_agree():
     random = np.random.default_rng(3)
     difference = random.normal(0.6, 1.0, 14)
-    exact = paired_difference(difference.tolist(), [0.0] * 14).p
-    sampled = paired_difference([*difference, 0.0], [0.0] * 15).p
+    exact = over_units(difference.tolist()).p
+    sampled = over_units([*difference.tolist(), 0.0]).p
     # A scan without difference changes nothing but the way p is computed; 9,999 draws: 3 standard errors.
     assert sampled == pytest.approx(exact, abs=3 * np.sqrt(exact * (1 - exact) / 9999) + 1e-4)
 
@@ -134,11 +133,8 @@ def test_sampled_and_exact_p_agree():
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: paired_difference([1.0], [1.0, 2.0]),
-        lambda: paired_difference([], []),
-        lambda: score_scan(
-            "a", np.full((64, 64), np.nan), np.zeros((64, 64)), np.ones((64, 64), bool), "none"
-        ),
+        lambda: over_units([]),
+        lambda: scored(np.full((64, 64), np.nan), np.zeros((64, 64)), "none"),
     ],
 )
 def test_bad_input_is_refused(call):

@@ -38,23 +38,31 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Decision, FoundEffect
 from litho_models.models import build_model
-from litho_models.planning import power
-from litho_models.planning.answers import _pairs, of_rivals
+from litho_models.planning import answers
+from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
 from litho_models.planning.deciding import MICROSCOPE, NONE, PRINTER, Judge, compared, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
-from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question
-from litho_models.planning.power import Z_DECIDED, surely_better
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals
+from litho_models.planning.questions import (
+    NoiseSpectrum,
+    OpenQuestions,
+    Owner,
+    Question,
+    Rival,
+    fit_rivals,
+    left_nm,
+    noise_spectrum,
+)
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import measurement
-from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
 from tests.litho_models.prints import write_store
+from tests.tables import require_tables_equal_record
 
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
@@ -270,7 +278,7 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
     sure, unsure = powers(0.0), powers(0.04)
     count = next(n for n, power_ in enumerate(sure) if power_ > 0.99)
     # In two of five draws the losses are closer than they were fitted.
-    assert unsure[count] < power.ENOUGH
+    assert unsure[count] < answers.ENOUGH
     assert unsure[0] > 0.1
 
 
@@ -307,8 +315,8 @@ def test_the_power_of_repeats_is_that_of_draws() -> None:
         ratio = between / data.var(axis=2, ddof=1).mean(axis=1)
         found.append(np.mean(ratio > bar) if share else np.mean(ratio < low))
     # 4000 draws: 0.8 % standard error at most.
-    assert power.of_repeats(prints, scans) == pytest.approx(min(found), abs=0.025)
-    assert power.of_repeats(1, 2) == power.of_repeats(4, 1) == 0.0
+    assert answers.of_repeats(prints, scans) == pytest.approx(min(found), abs=0.025)
+    assert answers.of_repeats(1, 2) == answers.of_repeats(4, 1) == 0.0
 
 
 # --- the plan
@@ -328,11 +336,17 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
         next_print(loop, tmp_path / "plan", report=killed, **settings)
     assert not (tmp_path / "plan").exists()
     told.clear()
+    with pytest.raises(KeyboardInterrupt):
+        next_print(loop, tmp_path / "plan", report=killed, **{**settings, "seed": 99})
+    assert "0 of 2 tiles are kept" in told[0]
+    told.clear()
     plan = next_print(loop, tmp_path / "plan", report=told.append, **settings)
     assert plan is not None
     assert "1 of 2 tiles are kept" in told[0]
     assert not any(text.startswith("tile 1") for text in told)
     assert NextPrint.read(tmp_path / "plan") == plan
+    middle = {"questions.csv": {"power": "", "random_power": ""}}
+    require_tables_equal_record(tmp_path / "plan", NextPrint.FILE_NAME, middle)
     with pytest.raises(InputError, match=r"seed = 0 where now 99 is asked"):
         next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]
@@ -590,7 +604,7 @@ def test_the_power_counts_the_form_as_the_decision_does() -> None:
 
     def powers(form_nm: float | None) -> list[float]:
         question = slope_question(form_nm=form_nm)
-        return [power.of_contrast(contrast, question, prints) for prints in (1, 4, 100)]
+        return [answers.of_contrast(contrast, question, prints) for prints in (1, 4, 100)]
 
     today = [norm.cdf(math.sqrt(prints) * squares / sd - Z_DECIDED) for prints in (1, 4, 100)]
     assert powers(None) == pytest.approx(today)

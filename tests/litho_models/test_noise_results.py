@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from benchmarks import virtual_noise
 from benchmarks.record import published
 from litho_data.virtual_fab.settings import Noise
 from litho_models.noise import NoiseAnalysis
+from litho_models.noise.report import write_noise_report
+from tests.tables import require_tables_equal_record
 
 
 @pytest.mark.parametrize("mark", ["dose matrix", "planted roughness"])
@@ -23,3 +27,16 @@ def test_no_dose_and_no_roughness_is_off_what_was_planted():
     found = NoiseAnalysis.read(virtual_noise.FOLDER / virtual_noise.REFERENCES)
     # 30,000 pixels know σ to 1 %; what `features` lacks of the printer adds as little.
     assert found.budget.floor.at("full").rmse_nm == pytest.approx(Noise().roughness_nm, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["references", "dose-matrix"])
+def test_every_column_of_a_table_is_the_field_that_it_names(name: str, tmp_path: Path) -> None:
+    result = NoiseAnalysis.read(virtual_noise.FOLDER / name)
+    write_noise_report(result, [], tmp_path)
+    result.write(tmp_path)
+    require_tables_equal_record(
+        tmp_path,
+        NoiseAnalysis.FILE_NAME,
+        {},
+        pivoted=("calibration.csv", "calibration_scans.csv", "variance.csv"),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_models.evaluation.diagnostics import tile_consistency
+from litho_models.evaluation.fit_cache import tile_consistency
 from litho_models.evaluation.tables import metric_table, metric_text, scan_table
 from litho_models.models import build_model
 from litho_models.prediction.cost import measured_predictions

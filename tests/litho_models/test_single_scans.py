@@ -189,3 +189,21 @@ def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_t
     study = study_of(scans)
     found = SingleScans(study, study.scans, truths(study.scans)).findings()
     assert {one.name for one in found if one.seen} == {"datum-offset"}
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_lines_that_a_scan_is_held_against_are_of_other_folds(axis: int) -> None:
+    """Its own heights, and those of its fold, move nothing of what all are said to share."""
+    scans = planted(count=6)
+    study = study_of(scans)
+    maps = truths(study.scans)
+    other = [
+        one.height_um + (0.1 * np.indices(one.shape)[axis] if fold == 0 else 0)
+        for one, fold in zip(scans, study.fold_of, strict=True)
+    ]
+    both = [
+        SingleScans(study, prepare_scans(own), maps)._with_profile(axis)
+        for own in (scans, with_heights(scans, other))
+    ]
+    for fold, before, after in zip(study.fold_of, *both, strict=True):
+        assert np.array_equal(before, after) == (fold == 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_data.store.lock_box import lock_box, lock_box_size
+from litho_data.store.lock_box import lock_box
 from litho_models.splits.folds import (
     Crop,
     grouped_folds,
@@ -35,7 +35,7 @@ def test_folds_depend_on_the_seed_and_not_on_the_order_of_the_ids():
 def test_the_recorded_folds_of_the_measured_prints_are_those_that_are_computed():
     record = Path(__file__).parents[2] / "datasets" / "neural-lithography.split.toml"
     stated = tomllib.loads(record.read_text(encoding="utf-8"))
-    locked = lock_box(MEASURED_IDS, PRINTS, lock_box_size(24))
+    locked = lock_box(MEASURED_IDS, PRINTS)
     assert stated["grouped"]["folds"] == grouped_folds([i for i in MEASURED_IDS if i not in locked], 5)
 
 

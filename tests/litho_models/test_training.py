@@ -24,7 +24,7 @@ from litho_models.layers.ranges import FLAT_FROM
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
-from litho_models.scan_terms.training import estimate_scan_terms, training_terms
+from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
 from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
 pytestmark = pytest.mark.numerics

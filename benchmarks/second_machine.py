@@ -1,0 +1,332 @@
+"""A second machine, measured: silicon written by electron beam, etched, and seen by an electron microscope.
+
+    litho-data build datasets/prefab-soi.toml --out prefab-soi.zarr
+    python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--publish]
+
+Models are fitted by fold, whole patterns held out, and judged by their edges. Then the loop: to a printer of
+a spot and a threshold, the part that improves the held-out edges most is added, as long as that is more than
+chance.
+An interrupted run resumes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.markdown_table import markdown_table, with_interval
+from benchmarks.record import conclude, options, origin, write_record
+from litho_data.commands.progress import progress, run_script
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.reports.pictures import new_figure
+from litho_data.store import PrintedScan, Store, open_store
+from litho_models.fitting.fit import common_geometry, fit_with_record
+from litho_models.fitting.runs import training_config
+from litho_models.fitting.small_models import fit_small_model
+from litho_models.models import build_model
+from litho_models.prediction.tiles import predict_scan
+from litho_models.scoring.films import film_edge_um, films_of_scan
+from litho_models.scoring.shapes import edges_of_scan
+from litho_models.scoring.statistics import bootstrap_interval, over_units
+from litho_models.splits.folds import Fold, plan_folds
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE = Path(__file__).parents[1] / "docs" / "second_machine.md"
+RESULT = PAGE.parent / "results" / "second-machine" / "second_machine.json"
+BASELINES = ("identity", "affine", "blur-table")
+BARE = {"spots": 1, "resist": "threshold", "diffusion": False, "etch_bias": False}
+PARTS: dict[str, dict[str, Any]] = {
+    "backscatter": {"spots": 2},
+    "diffusion": {"resist": "hill", "diffusion": True},
+    "etch bias": {"etch_bias": True},
+}
+BASE = "spot and threshold"
+WHOLE = " + ".join((BASE, *PARTS))
+# A printer of few numbers needs no more patterns than every second; each gives a window of 256 px.
+FITTED_EVERY = 2
+LEARNED: dict[str, dict[str, int]] = {
+    "features": {},
+    "random-features": {},
+    "pbl": {"steps": 60, "rounds": 1},
+    "fno": {"steps": 150, "rounds": 1},
+}
+CHANCE = 0.05
+AROUND_PX = 40
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Fit, judge, search, write."""
+    parser = options(__doc__, "write the tables into the page", RESULT)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--cache", type=Path, default=Path("runs/second-machine"), help="a file per fit")
+    parser.add_argument("--learned", default="", help=f"models to learn too, of {', '.join(LEARNED)}")
+    arguments = parser.parse_args()
+    store = open_store(arguments.store)
+    folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
+    bench = Bench(folds, arguments.cache)
+    tables = {name: bench.rows(name) for name in (*BASELINES, BASE)}
+    found, rounds = search(bench)
+    learned = [name for name in LEARNED if name in arguments.learned.split(",")]
+    for name in dict.fromkeys((label(found), WHOLE, *learned)):
+        tables[name] = bench.rows(name)
+    record = {
+        "run": origin(),
+        "dataset": store.dataset_id.model_dump(),
+        "patterns": [row["scan"] for row in tables[BASE]],
+        "fitted_every": FITTED_EVERY,
+        "learned": {name: LEARNED[name] for name in learned},
+        "models": [summary(name, rows, bench.values(name)) for name, rows in tables.items()],
+        "rounds": rounds,
+        "found": list(found),
+        "found_against_whole": compared(tables[label(found)], tables[WHOLE]),
+        "rows": tables,
+    }
+    if arguments.publish:
+        draw_places(store, bench, label(found)).savefig(arguments.out.with_name("places.png"), dpi=110)
+    conclude(record, text_of(record), arguments.out, PAGE, "second machine", published=arguments.publish)
+
+
+class Bench:
+    """Fits of models on the folds, each kept in a file."""
+
+    def __init__(self, folds: Sequence[Fold], cache: Path):
+        self.folds, self._cache = folds, cache
+        cache.mkdir(parents=True, exist_ok=True)
+
+    def rows(self, name: str) -> list[Row]:
+        """The figures of every held-out pattern."""
+        kept = [self.fit(name, fold) for fold in progress(self.folds, name)]
+        return sorted((row for one in kept for row in one["rows"]), key=lambda row: row["scan"])
+
+    def values(self, name: str) -> list[dict[str, float]]:
+        """The fitted values of every fold."""
+        return [self.fit(name, fold)["values"] for fold in self.folds]
+
+    def fit(self, name: str, fold: Fold) -> dict[str, Any]:
+        """Fitted values, and the figures of the held-out patterns."""
+        file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
+        if not file.exists():
+            bare = self.fit(BASE, fold)["values"] if name.startswith(f"{BASE} +") else {}
+            write_record(file, fit_and_judge(name, fold, bare))
+        return json.loads(file.read_text(encoding="utf-8"))
+
+
+def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str, Any]:
+    """One model fitted to the training patterns of a fold and judged on the held-out ones.
+
+    A printer of parts starts from its default values and from those of the bare printer; the better fit
+    counts.
+    """
+    geometry = common_geometry(fold.training)
+    printer = name.startswith(BASE)
+    fields = fields_of(name) if printer else {}
+    if name in LEARNED:
+        config = training_config("fast", name, {"nuisance": "none", **LEARNED[name]})
+        model = fit_with_record(name, fold.training, config).model
+    else:
+        fits = []
+        for start in ({}, bare) if bare else ({},):
+            model = build_model("e-beam" if printer else name, **{**fields, **start}, **geometry)
+            losses = fit_small_model(model, fold.training[::FITTED_EVERY], "none")
+            fits.append((losses[-1] if losses else 0.0, model))
+        model = min(fits, key=lambda one: one[0])[1]
+    values = {key: value.item() for key, value in getattr(model, "values", {}).items()}
+    return {"values": values, "rows": [judged(scan, predict_scan(model, scan)) for scan in fold.held_out]}
+
+
+def fields_of(name: str) -> dict[str, Any]:
+    """What makes a printer of the parts in its name."""
+    return BARE | {key: value for part in name.split(" + ")[1:] for key, value in PARTS[part].items()}
+
+
+def held_out_print(name: str, values: Mapping[str, float], scan: PrintedScan) -> np.ndarray:
+    """The film (ny, nx), µm, that a printer of these fitted values expects of a pattern."""
+    starts: dict[str, Any] = {key: value for key, value in values.items() if key != "bias_um"}
+    model = build_model("e-beam", **fields_of(name), **starts, **common_geometry([scan]))
+    if "bias_um" in values:
+        model.raw_bias_um.data = model.ranges["raw_bias_um"].raw(values["bias_um"])
+    return predict_scan(model, scan)
+
+
+def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
+    """Edges, area, features and height error of one pattern."""
+    residual_um = np.where(scan.usable, scan.height_um - prediction_um, np.nan)
+    edges = edges_of_scan(scan, prediction_um, residual_um)
+    films = films_of_scan(scan, prediction_um, residual_um)
+    return {
+        "scan": scan.id,
+        "edge_mean_nm": edges.mean_nm,
+        "edge_p95_nm": edges.p95_nm,
+        "edge_unmatched": edges.unmatched,
+        **films._asdict(),
+        "mae_nm": NM_PER_UM * float(np.nanmean(np.abs(residual_um))),
+    }
+
+
+def search(bench: Bench) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
+    """Parts added one by one: the best, if its gain is more than chance for so many tried."""
+    found: tuple[str, ...] = ()
+    rounds = []
+    while left := [part for part in PARTS if part not in found]:
+        before = bench.rows(label(found))
+        tried = {part: compared(before, bench.rows(label((*found, part)))) for part in left}
+        best = max(left, key=lambda part: tried[part]["gain_nm"])
+        taken = tried[best]["gain_nm"] > 0 and tried[best]["p"] * len(left) <= CHANCE
+        one = {"before": label(found), "tried": tried, "added": best if taken else None}
+        if rivals := sorted(set(left) - {best}, key=lambda part: tried[part]["gain_nm"]):
+            first, second = (bench.rows(label((*found, part))) for part in (best, rivals[-1]))
+            one |= {"rival": rivals[-1], "best_over_rival": compared(second, first)}
+        rounds.append(one)
+        if not taken:
+            break
+        found = (*found, best)
+    return found, rounds
+
+
+def label(parts: Sequence[str]) -> str:
+    """A printer by its parts; they are listed in one order, however they were found."""
+    return " + ".join((BASE, *(part for part in PARTS if part in parts)))
+
+
+def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
+    """Gain in edge error over the same patterns: mean, interval, p, and how many patterns improved."""
+    gains = [was["edge_mean_nm"] - now["edge_mean_nm"] for was, now in zip(before, after, strict=True)]
+    found = over_units(gains)
+    better = [found.positive, found.count]
+    return {"gain_nm": float(np.mean(gains)), "ci95_nm": found.ci95_nm, "p": found.p, "better": better}
+
+
+def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Means over patterns, sums of counts, and the fitted values over folds."""
+    errors = [row["edge_mean_nm"] for row in rows]
+    means = {
+        key: float(np.mean([row[key] for row in rows]))
+        for key in ("edge_p95_nm", "area_error_percent", "mae_nm")
+    }
+    sums = {key: sum(row[key] for row in rows) for key in ("missing", "extra", "merged", "edge_unmatched")}
+    spread = {key: [min(v[key] for v in values), max(v[key] for v in values)] for key in values[0]}
+    return {
+        "model": name,
+        "edge_mean_nm": float(np.mean(errors)),
+        "edge_mean_ci95_nm": bootstrap_interval(errors),
+        **means,
+        **sums,
+        "values": spread,
+    }
+
+
+def draw_places(store: Store, bench: Bench, name: str) -> Figure:
+    """The narrowest neck, the smallest island and the most rounded corner, each of a held-out pattern."""
+    kept = [bench.fit(name, fold) for fold in bench.folds]
+    values = {row["scan"]: one["values"] for one in kept for row in one["rows"]}
+    scans = [store.scan(scan_id) for scan_id in values]
+    figure = new_figure(10, 3.6)
+    for axes, (what, find) in zip(figure.subplots(1, 3), PLACES.items(), strict=True):
+        found = [(*find(scan), scan) for scan in scans]
+        _, (y, x), scan = min(found, key=lambda one: one[0])
+        window = tuple(slice(max(0, place - AROUND_PX), place + AROUND_PX) for place in (y, x))
+        film = scan.height_um[window]
+        axes.imshow(film, cmap="Greys_r", alpha=0.5)
+        edge = film_edge_um(scan)
+        printed = held_out_print(name, values[scan.id], scan)[window]
+        for one, colour, style in (
+            (scan.layout_um[window], "#4a74b0", ":"),
+            (film, "#111111", "-"),
+            (printed, "#c23b22", "-"),
+        ):
+            axes.contour(one, [edge], colors=[colour], linestyles=[style], linewidths=1.3)
+        axes.set_title(f"{what}: {scan.id}", fontsize=9)
+        axes.set_axis_off()
+    return figure
+
+
+def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
+    """Half the width (px) and the place of the narrowest film that goes on at both sides."""
+    from scipy.ndimage import binary_dilation, convolve
+    from skimage.morphology import medial_axis
+
+    line, half = medial_axis(_inner_film(scan), return_distance=True)
+    neighbours = convolve(line.astype(int), np.ones((3, 3), int)) - 1
+    ends = binary_dilation(line & (neighbours < 2), iterations=12)
+    return _least(np.where(line & ~ends & scan.valid, half, np.inf))
+
+
+def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
+    """Size (px) and place of the smallest island."""
+    from scipy.ndimage import label as labels
+
+    parts, _ = labels(_inner_film(scan))
+    size = np.bincount(parts.ravel())
+    return _least(np.where((parts > 0) & (size[parts] > 4), size[parts], np.inf))
+
+
+def corner(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
+    """Where an edge of the film differs most from the layout's, as a negative number, and its place."""
+    from scipy.ndimage import binary_dilation, gaussian_filter
+
+    film = _inner_film(scan)
+    edge = binary_dilation(film & binary_dilation(~film & scan.usable), iterations=6)
+    off = np.where(scan.usable & edge, np.abs(scan.height_um - scan.layout_um), 0)
+    return _least(-gaussian_filter(off, 3.0))
+
+
+def _inner_film(scan: PrintedScan) -> np.ndarray:
+    return scan.usable & (np.nan_to_num(scan.height_um) > film_edge_um(scan))
+
+
+def _least(field: np.ndarray) -> tuple[float, tuple[int, int]]:
+    inner = np.full(field.shape, np.inf)
+    cut = (slice(AROUND_PX, -AROUND_PX),) * 2
+    inner[cut] = field[cut]
+    y, x = np.unravel_index(int(np.argmin(inner)), inner.shape)
+    return float(inner[y, x]), (int(y), int(x))
+
+
+PLACES = {"neck": neck, "island": island, "corner": corner}
+
+
+def text_of(record: Mapping[str, Any]) -> str:
+    """Both tables."""
+    heads = (
+        "model",
+        "edges, mean (95 % over patterns)",
+        "P95",
+        "area",
+        "missing",
+        "extra",
+        "merged",
+        "height",
+    )
+    rows = [
+        (
+            one["model"],
+            with_interval(one["edge_mean_nm"], one["edge_mean_ci95_nm"]),
+            f"{one['edge_p95_nm']:.2f} nm",
+            f"{one['area_error_percent']:.2f} %",
+            *(str(one[key]) for key in ("missing", "extra", "merged")),
+            f"{one['mae_nm']:.2f} nm",
+        )
+        for one in record["models"]
+    ]
+    steps = [
+        (
+            *(step["before"], part, "{:+.3f} nm ({:+.3f} … {:+.3f})".format(one["gain_nm"], *one["ci95_nm"])),
+            *("{} of {}".format(*one["better"]), f"{one['p']:.4f}"),
+            "yes" if part == step["added"] else "no",
+        )
+        for step in record["rounds"]
+        for part, one in step["tried"].items()
+    ]
+    loop_heads = ("to", "part", "gain at held-out edges", "patterns improved", "p", "added")
+    return f"{markdown_table(heads, rows)}\n\n{markdown_table(loop_heads, steps)}"
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,202 @@
+"""What the three command lines share: their settings, exit codes, and errors of one line."""
+
+import errno
+import functools
+import inspect
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from io import TextIOWrapper
+from typing import Annotated, Any
+
+import typer
+
+from litho_data.commands.progress import command_line, given_words
+from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.run_facts import running_command
+
+# Typer does not export it under a name of its own: what its errors of usage are derived from.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+
+def option(help: str, *names: str, **more: Any) -> Any:
+    """An option of a command: what it is, its names where these are others, and what else typer takes."""
+    return typer.Option(*names, help=help, **more)
+
+
+def argument(help: str) -> Any:
+    """An argument of a command."""
+    return typer.Argument(help=help)
+
+
+_CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
+_LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, help="local processes; the result does not depend on it")
+]
+DaskOption = Annotated[
+    str | None,
+    option(
+        "address of a Dask scheduler, such as tcp://host:8786: its workers in the place of --workers",
+        "--dask",
+    ),
+]
+
+_LONGEST = 200
+_AGAIN = "what was finished is kept: give the command again"
+_WAYS_OUT = {
+    errno.ENOSPC: f"make room; {_AGAIN}",
+    errno.EDQUOT: f"make room; {_AGAIN}",
+    errno.EROFS: "choose another --out",
+    errno.EACCES: "choose another place, or ask for the right",
+    errno.EMFILE: f"allow more open files (ulimit -n), or fewer workers; {_AGAIN}",
+    errno.ENFILE: f"close other programs; {_AGAIN}",
+}
+
+
+def _show_all(context: typer.Context, asked: bool) -> None:
+    if asked and not context.resilient_parsing:
+        for parameter in context.command.params:
+            if hasattr(parameter, "hidden"):
+                parameter.hidden = False
+        typer.echo(context.get_help())
+        raise typer.Exit()
+
+
+HelpAll = Annotated[
+    bool, typer.Option("--help-all", help="show the other options too", is_eager=True, callback=_show_all)
+]
+
+
+def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
+    """Give a function that takes ``**values`` the signature that typer is to see."""
+    # Typer reads both.
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
+
+
+def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that hides some of its options ``--help-all``, which shows them."""
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        values.pop("help_all")
+        command(**values)
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    shown = [*own, inspect.Parameter("help_all", kind, default=False, annotation=HelpAll)]
+    return takes(run, [one.replace(kind=kind) for one in shown])
+
+
+def new_app(help_text: str) -> typer.Typer:
+    """A typer application with the settings of this project."""
+
+    def options(
+        context: typer.Context,
+        version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+    ) -> None:
+        if version:
+            from litho_data import __version__
+
+            typer.echo(__version__)
+            raise typer.Exit()
+        if context.invoked_subcommand is None:
+            typer.echo(context.get_help())
+            raise typer.Exit(2)
+
+    # Without invoke_without_command, --version alone would be asked for a command.
+    return typer.Typer(
+        help=help_text,
+        callback=options,
+        invoke_without_command=True,
+        pretty_exceptions_enable=False,
+        # Boxes leave a third of a line of 80 characters to what an option does.
+        rich_markup_mode=None,
+    )
+
+
+def run_app(app: typer.Typer, name: str) -> None:
+    """Run a typer application; what a machine or an input does not allow is one line and exit code 2.
+
+    Everything else that is raised is a defect of this project, with a traceback.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # Not every terminal has a µ.
+            stream.reconfigure(errors="replace")
+    try:
+        with running_command(command_line(name)):
+            code = app(prog_name=name, standalone_mode=False)
+    except BrokenPipeError:
+        # Who read the output, such as `head`, has had enough; Python would complain when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except UsageError as error:
+        said = _in_one_line(error, name, given_words())
+    except Exception as error:
+        refusal = error if isinstance(error, InputError) else _not_allowed(error)
+        if refusal is None:
+            raise
+        said = f"{name}: {refusal}"
+    else:
+        raise SystemExit(code if isinstance(code, int) else 0)
+    print(said, file=sys.stderr)
+    raise SystemExit(2)
+
+
+def _not_allowed(error: Exception) -> InputError | None:
+    """What a machine does not allow, in words; None for a defect of this project."""
+    # PyTorch and safetensors have errors of their own for it.
+    text = str(error)
+    if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
+        got = text.partition("\n")[0][:_LONGEST]
+        return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
+    if isinstance(error, OSError):
+        what = f"cannot use {error.filename}" if error.filename else "the system refuses"
+        return InputError(what, got=error, hint=_WAYS_OUT.get(error.errno or 0, _AGAIN))
+    if isinstance(error, RecursionError):
+        return InputError("input", got="parts within parts, too deep", wanted="a flatter file")
+    if isinstance(error, OverflowError):
+        return InputError("a number of the input", got=error, wanted="one of a size that can be")
+    return None
+
+
+def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
+    """What typer has to say about words that it cannot parse, as this project says it.
+
+    Args:
+        error: a ``UsageError``.
+        name: of the program.
+        words: its arguments.
+    """
+    command = error.ctx.command_path if error.ctx else " ".join([name, *words[:1]])
+    parameter = getattr(error, "param", None)
+    help_line = f"`{command} --help` shows what it takes"
+    if parameter is None:
+        near = getattr(error, "possibilities", None)
+        text = re.sub(r"\.? Did you mean (.*)\?$", r"; did you mean \1?", error.message.rstrip("."))
+        hint = f"did you mean {' or '.join(near)}?" if near else "" if "; did" in text else help_line
+        return f"{command}: {InputError(text[:1].lower() + text[1:], hint=hint)}"
+    option = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.name.upper()
+    if type(error).__name__ == "MissingParameter":
+        wanted = re.split(r"\.(?: (?=[A-Z])|$)", parameter.help)[0]
+        wanted = wanted[:1].lower() + wanted[1:] if wanted[1:2].islower() else wanted
+        return f"{command}: {InputError(option, got='none', wanted=wanted, hint=help_line)}"
+    if choice := _CHOICE.match(error.message):
+        known = re.findall(r"'([^']*)'", choice[2])
+        return f"{command}: {unknown_name(option, choice[1], known, help_line)}"
+    limit = _LIMIT.match(error.message)
+    wanted = f"a number ({limit[1]})" if limit else error.message
+    return f"{command}: {InputError(option, got=_given(parameter.opts, words), wanted=wanted)}"
+
+
+def _given(options: Sequence[str], words: Sequence[str]) -> str | None:
+    """What stands behind an option on the command line; None for an argument."""
+    for word, value in zip(words, [*words[1:], None], strict=True):
+        name, equals, rest = word.partition("=")
+        if name in options:
+            return repr(rest) if equals else value and repr(value)
+    return None

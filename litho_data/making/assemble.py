@@ -1,0 +1,262 @@
+"""From finished scans to a finished store: arrays, tables, manifest, attributes, hashes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from litho_data.cards.card import Card
+from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
+from litho_data.making.jobs import Job
+from litho_data.making.operations import READERS, no_recipe
+from litho_data.store.partial import outputs_of
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
+from litho_data.store.write import SHOWN, consolidate, write_samples, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import zarr
+
+Record = Mapping[str, Any]
+# The group that lists the scans for tools of OME-Zarr.
+IMAGES = "o"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Everything that a store is made from, with the raw files by id for the manifest.
+
+    ``files`` maps each id to its raw files by recorded name, ``standards`` holds those of the calibration;
+    ``unpaired`` and ``refused`` map ids to reasons.
+    """
+
+    card: Card
+    jobs: Sequence[Job]
+    data_dir: Path
+    files: Mapping[str, Mapping[str, Path]]
+    recipe: Mapping[str, Any] = field(default_factory=no_recipe)
+    seed: int = 0
+    standards: Mapping[str, Path] = field(default_factory=dict)
+    assumptions: Sequence[str] = ()
+    unpaired: Mapping[str, str] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+def assemble(
+    root: zarr.Group,
+    records: Sequence[Record],
+    load: Callable[[str], Mapping[str, Array]],
+    source: Source,
+    skipped: Mapping[str, str],
+    build: Record,
+) -> str:
+    """Write everything except the groups ``scans/<id>``, which exist; returns the dataset's hash.
+
+    Args:
+        root: the growing group.
+        records: of the finished scans, sorted by id, including references (``use`` other than dataset).
+        load: the arrays of an id on the layout grid.
+        source: what the records were made from.
+        skipped: per id, why it is not in the store.
+        build: what must not be part of a hash: time, folder, software.
+    """
+    scans = [_row(record) for record in records_of_use(records)]
+    write_samples(root, scans, load, source.card.layout.pitch_um)
+    quality, provenance = quality_table(records), provenance_table(records)
+    write_table(root, "quality", quality, "scan")
+    write_table(root, "provenance", provenance, "step")
+    manifest = manifest_attributes(source, quality, provenance)
+    files = files_table(source, {record["id"]: record for record in records}, skipped)
+    write_table(root, "manifest", files, "file", {**manifest, "build": dict(build)})
+    sha256 = dataset_sha256(
+        dataset_facts(source.card), [_identity(record) for record in records_of_use(records)]
+    )
+    manifest_sha256 = record_sha256([manifest, table_sha256(files)])
+    images = {"labels": [f"../scans/{record['id']}" for record in records]}
+    root.create_group(IMAGES, attributes=images)
+    root.attrs.update(root_attributes(manifest, sha256, manifest_sha256))
+    consolidate(root)
+    return sha256
+
+
+def records_of_use(records: Sequence[Record]) -> list[Record]:
+    """The records of the dataset's own scans, references left out, in order."""
+    return [record for record in records if record["use"] == "dataset"]
+
+
+def dataset_facts(card: Card) -> dict[str, Any]:
+    """What a card says about all scans, as part of the dataset's hash."""
+    layout = card.layout
+    facts: dict[str, Any] = {
+        name: getattr(layout, name) for name in ("pitch_um", "level_height_um", "levels")
+    }
+    if card.scan.instrument != "afm":
+        facts["instrument"] = card.scan.instrument
+    write = card.write.model_dump(exclude_none=True) if card.write else {}
+    return {**facts, "write": write} if write else facts
+
+
+def flat_facts(card: Card) -> dict[str, Any]:
+    """The same, without a table in it: its keys are those of ``WRITE``."""
+    facts = dataset_facts(card)
+    written = facts.pop("write", {})
+    return facts | {f"{WRITE}{key}": value for key, value in written.items()}
+
+
+def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
+    """The attributes of the root group; all but the two hashes follow from the manifest.
+
+    Numbers and words only, which any format can hold.
+    """
+    card = Card.model_validate(manifest["card"])
+    operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
+    return {
+        "Conventions": "CF-1.11",
+        "schema": STORE_SCHEMA,
+        "name": card.name,
+        "title": card.title,
+        "license": card.license,
+        "citation": card.citation,
+        **flat_facts(card),
+        # Tools for OME-Zarr look for images under the names in this list; a word of one letter is one name.
+        "labels": IMAGES,
+        "assumptions": "; ".join(manifest["assumptions"]),
+        "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
+        "dataset_sha256": dataset_hash,
+        "manifest_sha256": manifest_hash,
+    }
+
+
+def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.DataFrame) -> dict[str, Any]:
+    """The manifest without its table of files: the card as it was understood, and hashes of the tables."""
+    content = {
+        "card": source.card.model_dump(mode="json", exclude_none=True),
+        "recipe": dict(source.recipe),
+        "seed": source.seed,
+        "assumptions": list(source.assumptions),
+        "quality_sha256": table_sha256(quality),
+        "provenance_sha256": table_sha256(provenance),
+    }
+    return json.loads(json.dumps(content))
+
+
+def quality_table(records: Sequence[Record]) -> pd.DataFrame:
+    """One row per scan of the dataset; a figure that could not be computed is NaN."""
+    import pandas as pd
+
+    rows = []
+    for record in records_of_use(records):
+        ny, nx = _shape_of(record, "mask_level")
+        scan_ny, scan_nx = _shape_of(record, *SHOWN)
+        pitch_y_um, pitch_x_um = record.get("pitch_um", record["read"]["pitch_um"])
+        shape = {"layout_ny": ny, "layout_nx": nx, "scan_ny": scan_ny, "scan_nx": scan_nx}
+        pitch = {"scan_pitch_y_um": pitch_y_um, "scan_pitch_x_um": pitch_x_um}
+        rows.append({"scan": record["id"], **shape, **pitch, **record["quality"]})
+    return pd.DataFrame(rows)
+
+
+def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
+    """One row per step of every scan: the record as JSON, its id, and the software that ran it."""
+    import pandas as pd
+
+    rows = [
+        {
+            "scan": record["id"],
+            "op": step["op"],
+            "step_id": step["id"],
+            "record": canonical_json(step),
+            "software": canonical_json(record["software"]),
+        }
+        for record in records
+        for step in record["steps"]
+    ]
+    return pd.DataFrame(rows)
+
+
+def table_sha256(table: pd.DataFrame) -> str:
+    """Hash of a table: column names and values, in order, without the software column, which varies."""
+    columns = {}
+    for name in sorted(str(column) for column in table.columns if column != "software"):
+        values = table[name].to_numpy()
+        numeric = values.dtype.kind in "biuf"
+        columns[name] = (
+            array_sha256(values, "1", ("row",)) if numeric else record_sha256([str(v) for v in values])
+        )
+    return record_sha256(columns)
+
+
+def _row(record: Record) -> dict[str, Any]:
+    keys = ("id", "print", "order", "columns")
+    made = [output["name"] for output in outputs_of(record)]
+    return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level"), "arrays": made}
+
+
+def _identity(record: Record) -> dict[str, Any]:
+    hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
+    names = [*(variable.name for variable in SAMPLE_VARIABLES), "bend_um"]
+    arrays = {name: hashes[name] for name in names if name in hashes}
+    return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
+
+
+def _shape_of(record: Record, *names: str) -> tuple[int, int]:
+    shape = next(output["shape"] for output in outputs_of(record) if output["name"] in names)
+    return int(shape[0]), int(shape[1])
+
+
+def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[str, str]) -> pd.DataFrame:
+    """One row per raw file, sorted by id.
+
+    Args:
+        source: the files by id and recorded name, and which have no partner.
+        records: of the finished scans, by id.
+        skipped: per id, why it is not in the store.
+
+    Returns:
+        Columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256`` of the
+        bytes that were used (empty for a file that cannot be read), ``size_bytes``, and ``read``, JSON with
+        reader, unit, channel, pitch and the full header of the vendor.
+    """
+    import pandas as pd
+
+    rows = []
+    for scan_id in sorted(source.files):
+        record = records.get(scan_id)
+        status = "ok" if record else "skipped" if scan_id in skipped else "unpaired"
+        for name, path in source.files[scan_id].items():
+            sha256, size = _file_identity(path)
+            row = {"path": name, "scan": scan_id, "status": status}
+            row["reason"] = skipped.get(scan_id, source.unpaired.get(scan_id, ""))
+            row["use"] = record["use"] if record else ""
+            row["sha256"] = (_used_sha256(record, name) if record else "") or sha256
+            rows.append(
+                {**row, "size_bytes": size, "read": json.dumps(_facts(record, name), ensure_ascii=False)}
+            )
+    for name, path in source.standards.items():
+        sha256, size = _file_identity(path)
+        row = {"path": name, "scan": "", "status": "ok", "reason": "", "use": "calibration"}
+        rows.append({**row, "sha256": sha256, "size_bytes": size, "read": "{}"})
+    return pd.DataFrame(rows)
+
+
+def _file_identity(path: Path) -> tuple[str, int]:
+    try:
+        return file_sha256(path), path.stat().st_size
+    except OSError:
+        return "", 0
+
+
+def _used_sha256(record: Mapping[str, Any], name: str) -> str:
+    hashes = {one["name"]: one["sha256"] for step in record["steps"] for one in step["inputs"]}
+    return hashes.get(name, "")
+
+
+def _facts(record: Mapping[str, Any] | None, name: str) -> dict[str, Any]:
+    """Facts about a scan file from its reader; none for a layout."""
+    for step in record["steps"] if record else ():
+        if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
+            return dict(record["read"])
+    return {}

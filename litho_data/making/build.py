@@ -1,0 +1,259 @@
+"""``build_dataset``: raw files and a card in, a dataset store and a report out."""
+
+import functools
+import os
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from litho_data.cards.card import Card, with_tip
+from litho_data.cards.listing import Listing, list_fields
+from litho_data.commands.progress import progress, say
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import software_record
+from litho_data.making.assemble import Source, assemble, records_of_use
+from litho_data.making.calibration import measure_scales, standards_of
+from litho_data.making.day_tip import with_tip_found
+from litho_data.making.jobs import FieldJob, Job, Skipped, field_jobs, finish
+from litho_data.making.operations import UNREGISTERED, load_recipe, no_recipe
+from litho_data.making.report import write_report
+from litho_data.making.result import BuildResult, LeftOut, report_folder
+from litho_data.making.right_layout import doubts, fitting_layout, prints_of
+from litho_data.making.verdict import Weight, findings, odd_heights, require_heights
+from litho_data.sharing.workers import HERE, Workers, run_jobs
+from litho_data.store.partial import PartialStore, partial_store
+from litho_data.store.schema import DatasetId
+
+# A larger difference from the pixel aspect of other scans comes from missing rows or columns.
+_ASPECT_TOLERANCE = 1e-3
+_MOST_SEARCHES = 2000
+
+
+def build_dataset(
+    card_path: str | Path,
+    out: str | Path,
+    *,
+    data_dir: str | Path | None = None,
+    workers: int = 1,
+    dask: str | None = None,
+    strict: bool = False,
+    seed: int = 0,
+    tip: float | str | None = None,
+) -> BuildResult:
+    """Build a dataset store from a card.
+
+    Each scan is read, levelled by the card's recipe, registered and resampled once onto its layout's grid.
+    A scan that cannot be used is skipped, with a line on stderr and a reason in the manifest. The store
+    appears whole or not at all; an interrupted build resumes. The report goes to ``<name>-report`` beside the
+    store.
+
+    Args:
+        card_path: the dataset card.
+        out: folder of the store; an older store there is replaced.
+        data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
+            user cache, whichever has them.
+        workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
+        strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
+        seed: of the robust registration.
+        tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans, in place of the
+            card's: pixels that it may not have touched are not valid.
+
+    Raises:
+        InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, a tip that is no
+            radius, or ``out`` that is no store.
+    """
+    listing = list_fields(card_path, data_dir)
+    if tip is not None:
+        listing = replace(listing, card=with_tip(listing.card, tip))
+    recipe = _recipe(listing)
+    places = Workers(workers, dask)
+    jobs = with_tip_found(field_jobs(listing, recipe, seed), places)
+    source = _source(listing, recipe, seed, jobs)
+    return make_store(source, Path(out), workers=places, strict=strict)
+
+
+def _recipe(listing: Listing) -> dict[str, Any]:
+    level = listing.card.process.level
+    if level is None and (listing.card.scan.levelled or listing.card.scan.instrument == "sem"):
+        return no_recipe()
+    return load_recipe(None if level is None else listing.card_path.parent / level)
+
+
+def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
+    standards = standards_of(listing)
+    if standards.described:
+        # A bad standard spoils every scan: said once, before any is made.
+        measure_scales(standards.described, list(standards.files.values()))
+    found = {one.id: [one.layout, one.scan] for one in listing.fields}
+    found |= {one.id: [*one.files] for one in listing.left_aside}
+    return Source(
+        card=listing.card,
+        jobs=jobs,
+        data_dir=listing.data_dir,
+        standards=standards.files,
+        files={key: {listing.relative(path): path for path in paths if path} for key, paths in found.items()},
+        recipe=recipe,
+        seed=seed,
+        assumptions=listing.assumptions,
+        unpaired={one.id: one.reason for one in listing.left_aside if one.unpaired},
+        refused={one.id: one.reason for one in listing.left_aside if not one.unpaired},
+    )
+
+
+def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
+    """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    with partial_store(out) as partial:
+        root = partial.open()
+        try:
+            records = partial.finished(root, {job.id: job.key for job in source.jobs})
+            reused = len(records)
+            skipped = dict(source.refused)
+            for scan_id, reason in skipped.items():
+                _report_skipped(scan_id, reason)
+            todo = [job for job in source.jobs if job.id not in records]
+            say(f"building {source.card.name}: {len(todo)} of {len(source.jobs)} scans to do")
+            making = functools.partial(finish, unfinished=partial)
+            finished = run_jobs(making, todo, workers, name=lambda job: job.id)
+            for job, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
+                if isinstance(outcome, Skipped):
+                    # Recorded names: the manifest must not depend on where the raw files lie.
+                    skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
+                    _report_skipped(outcome.id, skipped[outcome.id])
+                else:
+                    records[job.id] = dict(outcome)
+        except InputError:
+            # Of the cluster: finished scans stay for the next run.
+            if not records:
+                partial.discard()
+            raise
+        try:
+            for scan_id, reason in _odd_pixels(records, source.card).items():
+                _leave_out(scan_id, reason, records, skipped, partial)
+            prints = prints_of(records_of_use(list(records.values())), partial.samples)
+            for scan_id, reason in odd_heights(prints).items():
+                _leave_out(scan_id, reason, records, skipped, partial)
+            prints = [one for one in prints if one.id in records]
+            named = _name_layouts(source.jobs, skipped)
+            _require_enough(records, {**skipped, **source.unpaired}, strict, out)
+            require_heights(prints, source.card)
+        except InputError:
+            partial.discard()
+            raise
+        doubted = doubts(prints)
+        for scan_id, doubt in doubted.items():
+            quality = dict(records[scan_id]["quality"])
+            quality["warning"] = "; ".join(filter(None, (quality["warning"], doubt)))
+            records[scan_id]["quality"] = quality
+        kept = [records[scan_id] for scan_id in sorted(records)]
+        build = {
+            "started": started.isoformat(),
+            "data_dir": _relative(source.data_dir, out.parent),
+            "software": software_record(),
+        }
+        of_use = records_of_use(kept)
+        found = findings(of_use, prints, {**doubted, **named}, skipped, source.card)
+        for one in found:
+            if one.weight != Weight.SKIPPED:
+                print(f"check {one}", file=sys.stderr)
+        sha256 = assemble(root, kept, partial.samples, source, skipped, build)
+        result = BuildResult(
+            store=out.name,
+            dataset=DatasetId(name=source.card.name, sha256=sha256),
+            n_scans=len(of_use),
+            n_references=len(kept) - len(of_use),
+            findings=found,
+            skipped=_left_out(skipped),
+            unpaired=_left_out(source.unpaired),
+            reused=reused,
+            seconds=round(time.perf_counter() - clock, 2),
+            workers=workers.processes,
+            software=software_record(),
+        )
+        write_report(result, partial.store, report_folder(out))
+        partial.publish()
+    return result
+
+
+def _relative(folder: Path, start: Path) -> str:
+    """Path of the raw files from the store's folder, so that both can move together."""
+    try:
+        return Path(os.path.relpath(folder, start)).as_posix()
+    except ValueError:  # another drive
+        return str(folder)
+
+
+def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
+    """Say of scans that did not register which other layout of the set they show, if there is one."""
+    named = {}
+    fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
+    lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
+    layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
+    # One layout may be printed, and one print scanned, more than once: it goes by its first id.
+    distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
+    # A search takes a twentieth of a second.
+    for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
+        read = fields[key].read()
+        if "raw_height_um" not in read.arrays:
+            continue
+        own = layouts[key].tobytes() if key in layouts else None
+        others = {name: layouts[name] for held, name in distinct.items() if held != own}
+        height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
+        pitch_um = fields[key].card.layout.pitch_um
+        if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):
+            named[key] = f"it shows the layout of {fits}"
+            skipped[key] += f"; {named[key]}"
+    return named
+
+
+def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
+    """Scans whose pixels have another aspect than most, if the card and not the file gives the size.
+
+    A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
+    """
+    if card.scan.size_um is None:
+        return {}
+    aspects = {
+        key: record["read"]["pitch_um"][0] / record["read"]["pitch_um"][1] for key, record in records.items()
+    }
+    ordered = sorted(aspects.values())
+    most = ordered[len(ordered) // 2] if ordered else 1.0
+    odd = {key: value for key, value in aspects.items() if abs(value / most - 1) > _ASPECT_TOLERANCE}
+    if 2 * len(odd) >= len(aspects):
+        return {}
+    reason = "pixel sides y/x {:.4g} where most scans have {:.4g}: rows or columns are missing"
+    return {key: reason.format(value, most) for key, value in odd.items()}
+
+
+def _leave_out(
+    scan_id: str, reason: str, records: dict[str, Any], skipped: dict[str, str], partial: PartialStore
+) -> None:
+    skipped[scan_id] = reason
+    _report_skipped(scan_id, reason)
+    del records[scan_id]
+    shutil.rmtree(partial.store / "scans" / scan_id)
+
+
+def _report_skipped(scan_id: str, reason: str) -> None:
+    print(f"skipped {scan_id}: {reason}", file=sys.stderr)
+
+
+def _require_enough(
+    records: Mapping[str, Mapping[str, Any]], left_out: Mapping[str, str], strict: bool, out: Path
+) -> None:
+    shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
+    if strict and left_out:
+        raise InputError(
+            f"{out} not built: {len(left_out)} ids cannot be used", got=shown, wanted="all, with --strict"
+        )
+    if not records_of_use(list(records.values())):
+        raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")
+
+
+def _left_out(reasons: Mapping[str, str]) -> list[LeftOut]:
+    return [LeftOut(id=scan_id, reason=reason) for scan_id, reason in sorted(reasons.items())]

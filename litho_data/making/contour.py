@@ -1,0 +1,111 @@
+"""From an electron micrograph to the edges of a film: signed distances, and the height they stand for.
+
+What stands up is bright, its rim brightest, and charging bends both; the edge is taken half way between the
+brightness of the ground and that of the rim, both as they are around it. Where the wall of the film has its
+edge within the width of the rim's flank is a convention that a micrograph cannot check.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
+
+REACH_PX = 8.0
+"""Distances are known up to this many pixels of the micrograph; beyond they are this."""
+_NOISE_PX = 1.0
+# Where the brightness of rim and ground is taken, px from the first edge, and over which length (sigma).
+_RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
+# The edge is sought so close to the first, that of one threshold for the whole picture.
+_NEAR_PX = 5
+_SPECK_PX = 40
+_DARKEST = 1.0
+_STEP_PX = 0.2
+# A part of the layout of which so little is as wanted is lost.
+_LOST = 0.1
+
+
+class Edges(NamedTuple):
+    """``distance_px`` (ny, nx) from the nearest edge, positive on the film; ``sigma_px``: of one edge pixel.
+
+    ``specks``: bool (ny, nx), dots and pinholes of at most 40 px, which were passed over.
+    """
+
+    distance_px: Array
+    specks: Array
+    sigma_px: float
+
+
+def find_edges(grey: Array) -> Edges:
+    """Edges of the film in a micrograph (ny, nx), to a fraction of a pixel.
+
+    Raises:
+        InputError: a picture without edges.
+    """
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+    from scipy.spatial import cKDTree
+    from skimage.filters import threshold_otsu
+    from skimage.measure import find_contours
+    from skimage.morphology import remove_small_holes, remove_small_objects
+
+    smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
+    # Of logarithms: bright rims and charging count for less.
+    logarithm = np.log(smooth + _DARKEST)
+    first = logarithm > threshold_otsu(logarithm)
+    film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)
+    if film.all() or not film.any():
+        raise InputError("micrograph", got="no edge", wanted="bright film on dark ground, or the reverse")
+    inside, outside = distance_transform_edt(film), distance_transform_edt(~film)
+
+    def around(distance: Array, zone: tuple[int, int]) -> Array:
+        weight = ((distance > zone[0]) & (distance <= zone[1])).astype(float)
+        total, share = (gaussian_filter(one, _AROUND_PX) for one in (weight * smooth, weight))
+        return total / np.maximum(share, 1e-12)
+
+    above = smooth - (around(inside, _RIM_PX) + around(outside, _GROUND_PX)) / 2
+    height = float(np.abs(above).max())
+    above = np.where(inside > _NEAR_PX, height, np.where(outside > _NEAR_PX, -height, above))
+    lines = find_contours(above, 0.0)
+    if not lines:
+        raise InputError("micrograph", got="no edge", wanted="bright film on dark ground, or the reverse")
+    points = np.concatenate([_dense(line) for line in lines])
+    near = np.where(film, inside, outside) <= REACH_PX + _NEAR_PX
+    reached, _ = cKDTree(points).query(np.argwhere(near), distance_upper_bound=REACH_PX)
+    distance = np.full(smooth.shape, REACH_PX)
+    distance[near] = np.minimum(reached, REACH_PX)
+    slope = np.hypot(*np.gradient(smooth))[np.abs(above) < height / 4]
+    noise = np.std((smooth - gaussian_filter(smooth, 2 * _NOISE_PX))[outside > _GROUND_PX[0]])
+    return Edges(np.where(above > 0, distance, -distance), film != first, float(noise / np.median(slope)))
+
+
+def _dense(line: Array) -> Array:
+    """Points along a contour (n, 2), evenly spaced."""
+    along = np.r_[0.0, np.hypot(*np.diff(line, axis=0).T).cumsum()]
+    places = np.arange(0.0, along[-1], _STEP_PX)
+    return np.stack([np.interp(places, along, line[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def coverage(distance_um: Array, pitch_um: float) -> Array:
+    """Share of each pixel that film covers, 0 to 1, from the signed distance of its centre from an edge."""
+    return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
+
+
+def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
+    """Where a micrograph shows what cannot be print: film deep in a gap of the layout, or a pit in its film.
+
+    A gap that is closed as a whole, or an island lost as a whole, is print.
+
+    Args:
+        covered: coverage (ny, nx), NaN where not seen; ``layout_share``: that of the layout.
+        depth_px: from the layout's edges: what lies nearer may be print. Widened by as much.
+    """
+    from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
+
+    found, wrong = covered > 0.5, np.zeros(covered.shape, bool)
+    for wanted in (layout_share > 0.5, layout_share <= 0.5):
+        parts, count = label(wanted)
+        as_wanted = np.isfinite(covered) & (found == (layout_share > 0.5))
+        kept = np.r_[0.0, mean(as_wanted, parts, np.arange(1, count + 1))][parts] > _LOST
+        wrong |= np.isfinite(covered) & ~as_wanted & kept & (distance_transform_edt(wanted) > depth_px)
+    return binary_dilation(wrong, iterations=depth_px) if wrong.any() else wrong

@@ -1,0 +1,46 @@
+"""The tip behind all scans of a card, found before they are built."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+
+from litho_data.foundation.errors import InputError
+from litho_data.making.jobs import FieldJob, scaled_pitch_um
+from litho_data.sharing.workers import Workers, run_jobs
+from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
+
+
+def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
+    """The jobs with the radius in the place of ``blind``, or without a tip where the scans set no bound.
+
+    Says on stderr what was found. Scans that cannot be read say nothing here; their jobs tell why.
+    """
+    if not jobs or jobs[0].card.process.tip != "blind":
+        return list(jobs)
+    bounds = run_jobs(tip_of, jobs, workers, name=lambda job: job.id)
+    found = [one for _, one in bounds if one is not None]
+    tip = of_one_tip(found) if found else None
+    radius_um = None if tip is None else tip.radius_um
+    if tip is None or radius_um is None:
+        print("tip: no scan sets a bound on its radius, so no pixel is left out", file=sys.stderr)
+    elif tip.reason:
+        print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
+    else:
+        print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
+    # Rounded far below its uncertainty: the order in which scans are finished must not show.
+    rounded = None if radius_um is None else float(f"{radius_um:.9g}")
+    card = jobs[0].card
+    process = card.process.model_copy(update={"tip": rounded})
+    return [replace(job, card=card.model_copy(update={"process": process})) for job in jobs]
+
+
+def tip_of(job: FieldJob) -> PeakRadius | None:
+    """What one scan says about the tip, in calibrated lengths if there are standards; None if unread."""
+    try:
+        read, calibrated = job.read(), job.calibrate()
+    except InputError:
+        return None
+    scales = {} if calibrated is None else calibrated.facts
+    pitch_y_um, pitch_x_um = scaled_pitch_um(read.facts["pitch_um"], scales)
+    height_um = read.arrays["raw_height_um"].astype(float) * scales.get("scale_z", 1.0)
+    return peak_radius(height_um, (pitch_y_um, pitch_x_um))

@@ -1,0 +1,178 @@
+"""The report of a build: what went in, what came out, and pictures of every scan."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
+from litho_data.making.gratings import GratingScan, grating_scans
+from litho_data.making.verdict import verdict_of
+from litho_data.reports.page import Page
+from litho_data.reports.pictures import colour_bar_png, coloured_png, limits, thumbnail
+from litho_data.store.read import PrintedScan, Store, open_store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from litho_data.making.result import BuildResult
+
+_MAX_SCANS_SHOWN = 48
+# Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
+_BLUR_PX = 3.0
+_STAGES = {
+    "layout (level)": "viridis",
+    "raw (nm; grey of a micrograph)": "cividis",
+    "registered (nm)": "cividis",
+    "residual (nm)": "RdBu_r",
+}
+# By table the columns in their order, each with its title and what it means.
+_COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
+
+
+def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
+    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; returns the page's path."""
+    store = open_store(store_path)
+    page = Page(
+        f"Dataset {store.name}",
+        "Raw scans read, levelled, registered onto their layouts and stored.",
+        facts={"dataset": store.sha256},
+        words={key: words for table in _COLUMNS.values() for key, words in table.items()},
+    )
+    _summary(page, result, store)
+    _left_out(page, result)
+    _pictures(page, store)
+    _warnings(page, store.quality)
+    _gratings(page, grating_scans(store))
+    _quality(page, store.quality)
+    result.write(folder)
+    with atomic_file(folder / "quality.csv") as temporary:
+        store.quality.to_csv(temporary, index=False)
+    return page.write(folder)
+
+
+def _summary(page: Page, result: BuildResult, store: Store) -> None:
+    quality = store.quality
+    page.verdict(verdict_of(result.findings, result.n_scans))
+    tiles = [(str(result.n_scans), "scans in the store")]
+    if "ncc_after" in quality:
+        tiles.append((f"{quality['ncc_after'].median():.3f}", "median correlation of height and layout"))
+    if "tre_median_nm" in quality:
+        tiles.append((f"{quality['tre_median_nm'].median():.0f} nm", "median held-out registration error"))
+    tiles.append((f"{result.seconds:.1f} s", "time of the build"))
+    page.tiles(tiles)
+    page.paragraph(
+        f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
+        "The hash of the dataset, below, covers layouts, heights, validity and transforms of all scans; "
+        "building again gives the same."
+    )
+    assumed = store.manifest["assumptions"]
+    page.note(*(f"Assumed, because the card does not say: {assumption}." for assumption in assumed))
+
+
+def _left_out(page: Page, result: BuildResult) -> None:
+    if result.findings:
+        page.heading("To do")
+        table = [{"scan": one.scan, "what": one.text} for one in result.findings]
+        page.table(table, "What speaks against the dataset, worst first", "findings.csv")
+    apart = {"skipped": result.skipped, "unpaired": result.unpaired}
+    rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
+    if rows:
+        page.heading("Not in the store")
+        caption = "Ids that are not in the store, and why; `--strict` refuses to build without them"
+        page.table(rows, caption, "left_out.csv")
+
+
+def _warnings(page: Page, quality: pd.DataFrame) -> None:
+    if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
+        page.heading("Passed with a note", folded=True)
+        alike = quality[warned].groupby("warning", sort=False)["scan"].agg(", ".join).reset_index()
+        page.table(alike, "What to know about these scans", "warnings.csv")
+
+
+def _quality(page: Page, quality: pd.DataFrame) -> None:
+    page.heading("Quality of every scan, in numbers", folded=True)
+    shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
+    page.table(
+        shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
+    )
+    if "sigma_nm" in quality:
+        page.table(
+            quality[list(_COLUMNS["uncertainty"])],
+            "What the uncertainty of the heights is made of: root mean square over a scan, its offset "
+            "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
+            "uncertainty.csv",
+            digits=2,
+        )
+
+
+def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
+    if scans:
+        page.heading("What the grating says about the microscope")
+        page.table(
+            [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
+            "Scales, unevenness of a line and tip, from the known period of the grating; no other scan is "
+            "corrected by them",
+            "gratings.csv",
+            digits=4,
+        )
+
+
+def _pictures(page: Page, store: Store) -> None:
+    page.heading("Every scan")
+    ids = _shown_ids(store)
+    if len(ids) < len(store):
+        page.note(f"The {len(ids)} scans with the lowest correlation with their layout, of {len(store)}.")
+    stages = [_stages(store, scan_id) for scan_id in ids]
+    columns, pictures = [], []
+    for (title, colours), images in zip(_STAGES.items(), zip(*stages, strict=True), strict=True):
+        low, high = _range(images, symmetric=colours == "RdBu_r")
+        columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
+        pictures.append([coloured_png(image, colours, low, high) for image in images])
+    caption = (
+        "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
+        "Residual: registered height minus the blurred layout, with the best gain and offset. "
+        "One colour scale per column."
+    )
+    page.gallery(columns, list(zip(ids, zip(*pictures, strict=True), strict=True)), caption)
+
+
+def _shown_ids(store: Store) -> list[str]:
+    if len(store) <= _MAX_SCANS_SHOWN or "ncc_after" not in store.quality:
+        return store.ids[:_MAX_SCANS_SHOWN]
+    worst = store.quality.sort_values("ncc_after")["scan"].head(_MAX_SCANS_SHOWN)
+    return [str(scan_id) for scan_id in worst]
+
+
+def _stages(store: Store, scan_id: str) -> list[Array]:
+    """Thumbnails of a scan, in the order of ``_STAGES``."""
+    scan = store.scan(scan_id)
+    images = [scan.mask_level, _raw(store, scan_id), scan.height_um * 1e3, _residual_nm(scan)]
+    return [thumbnail(image) for image in images]
+
+
+def _raw(store: Store, scan_id: str) -> Array:
+    """Heights in nm or, of a micrograph, grey values."""
+    if store.instrument == "sem":
+        return store.scan_frame(scan_id, "micrograph").astype(float)
+    return store.scan_frame(scan_id, "raw_height_um") * 1e3
+
+
+def _residual_nm(scan: PrintedScan) -> Array:
+    from litho_data.register import predicted_topography
+
+    layout = predicted_topography(scan.mask_level, _BLUR_PX).astype(float)
+    design = np.stack([layout, np.ones(scan.shape)], axis=-1)
+    response, *_ = np.linalg.lstsq(design[scan.valid], scan.height_um[scan.valid].astype(float), rcond=None)
+    return (scan.height_um - design @ response) * 1e3
+
+
+def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
+    values = np.concatenate([image.ravel() for image in images])
+    low, high = limits(values)
+    return (-max(-low, high), max(-low, high)) if symmetric else (low, high)

@@ -1,0 +1,225 @@
+"""Which recipe levels the scans of a card best: compared on three of them, by what the layout explains."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import ndimage
+
+from litho_data.cards.listing import list_fields
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
+from litho_data.level.recipe import Recipe
+from litho_data.making.jobs import FieldJob, field_jobs, scaled_pitch_um
+from litho_data.making.operations import OPERATIONS, load_recipe
+
+if TYPE_CHECKING:
+    from litho_data.reports.page import Page
+
+RECIPES: dict[str, str] = {
+    "plane": """[[step]]
+op = "layout-aware"
+""",
+    "plane and bow": """[[step]]
+op = "layout-aware"
+total_degree = 2
+""",
+    "plane and bow to degree 3": """[[step]]
+op = "layout-aware"
+total_degree = 3
+""",
+    "lines, then plane and bow": """[[step]]
+op = "align-rows"
+method = "median-of-differences"
+
+[[step]]
+op = "layout-aware"
+total_degree = 2
+""",
+    "plane and bow, then lines": """[[step]]
+op = "layout-aware"
+total_degree = 2
+
+[[step]]
+op = "align-rows"
+method = "median-of-differences"
+""",
+}
+"""What is compared, the simplest first."""
+_SCANS = 3
+# A recipe has to leave this much less than a simpler one.
+_BETTER = 0.95
+_BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
+_LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
+_PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """The recipe that leaves least, and what each leaves of each scan, nm.
+
+    ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks
+    outside its fit; ``card`` is the written card; ``warned`` maps recipes to what was said of them.
+    """
+
+    recipe: str
+    left_nm: Mapping[str, Mapping[str, float]]
+    warned: Mapping[str, str]
+    card: Path
+
+
+def suggest_recipe(
+    card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None
+) -> Suggestion:
+    """Compare recipes on three scans of a card; write the best, a card that names it, and a page.
+
+    Levelled heights are explained by a free response to the blurred layout, fitted in half of the blocks of
+    16 px. What it leaves in the other half decides: the tilt that a recipe leaves and the print that it takes
+    out both count. A recipe that moves lines whose pixels did not move is not suggested.
+
+    Args:
+        card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
+        out: folder of the page with pictures.
+        data_dir: folder of the raw files, as for ``build_dataset``.
+
+    Raises:
+        InputError: a bad card, one of micrographs, or no scan that can be read and registered.
+    """
+    listing = list_fields(card_path, data_dir)
+    if listing.card.scan.instrument == "sem":
+        raise InputError("recipes to compare", got="micrographs", wanted="scans of heights")
+    jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
+    # Three apart; others where one of them cannot be used.
+    places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()
+    places += [place for place in range(len(jobs)) if place not in places]
+    left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
+    warned: dict[str, str] = {}
+    pictures: dict[str, list[Array]] = {}
+    refusal = ""
+    for job in (jobs[place] for place in places):
+        if len(pictures) == _SCANS:
+            break
+        try:
+            raw_um, layout, pitch_um = _located(job)
+        except InputError as error:
+            refusal = f"{job.id}: {error}"
+            continue
+        pictures[job.id] = [raw_um]
+        for name, text in RECIPES.items():
+            height_um, note = _levelled(text, raw_um, layout, pitch_um)
+            left[name][job.id] = 1e3 * left_by_layout(height_um, layout)
+            pictures[job.id].append(height_um)
+            warned |= {name: note} if note else {}
+    if not pictures:
+        raise InputError("scans to compare recipes on", got=refusal, wanted="one that registers")
+    usual = {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
+    if not usual:
+        raise InputError(
+            "recipes to compare", got="; ".join(warned.values()), wanted="one that can be applied"
+        )
+    best = _best(usual)
+    card = _write_card(Path(card_path), best)
+    suggestion = Suggestion(best, left, warned, card)
+    _write_page(suggestion, pictures, Path(out))
+    return suggestion
+
+
+def _best(left_nm: Mapping[str, float]) -> str:
+    """The one that leaves least; a simpler one, which comes first, if it leaves hardly more."""
+    least = min(left_nm.values())
+    return next(name for name, left in left_nm.items() if left * _BETTER <= least)
+
+
+def _located(job: FieldJob) -> tuple[Array, Array, Sequence[float]]:
+    """Raw heights (ny, nx) µm, the layout in the scan's frame, NaN outside it, and the pitch (y, x)."""
+    read, layout, calibrated = job.read(), job.layout(), job.calibrate()
+    if layout is None:
+        raise InputError(f"layout of {job.id}", got="none that can be read")
+    pitch_um = scaled_pitch_um(read.facts["pitch_um"], calibrated.facts if calibrated else {})
+    raw = read.arrays["raw_height_um"]
+    params = job.register_params(pitch_um, read.facts["fast_axis"])
+    found = OPERATIONS["locate"].run(params, {}, {"mask_level": layout, "raw_height_um": raw})
+    return raw.astype(float), found.arrays["layout_in_scan"], pitch_um
+
+
+def _levelled(recipe: str, raw_um: Array, layout: Array, pitch_um: Sequence[float]) -> tuple[Array, str]:
+    """The heights, and what speaks against the recipe; one that cannot be applied leaves them as they are."""
+    pitch = (float(pitch_um[0]), float(pitch_um[1]))
+    try:
+        steps = Recipe.from_dict(tomllib.loads(recipe))
+        levelled, notes = steps.apply_noting(raw_um, pitch_um=pitch, layout_level=layout)
+    except InputError as error:
+        return raw_um, str(error)
+    return levelled.height, "; ".join(notes)
+
+
+def left_by_layout(height_um: Array, layout: Array) -> float:
+    """Root mean square of what a free response to the layout leaves in blocks outside its fit, µm.
+
+    Args:
+        height_um: (ny, nx), NaN where not measured.
+        layout: levels in the scan's frame, NaN outside the layout.
+    """
+    known = np.isfinite(layout)
+    inner = known & np.isfinite(height_um) & (ndimage.distance_transform_edt(known) > _BORDER_PX)
+    level = ndimage.gaussian_filter(np.where(known, layout, 0.0), _BLUR_PX)
+    y, x = np.indices(layout.shape) // _BLOCK_PX
+    fitted = inner & ((y + x) % 2 == 0)
+    knots = np.arange(int(level[inner].max()) + 2)
+    design = np.clip(1 - np.abs(level[inner][:, None] - knots), 0, None)
+    response, *_ = np.linalg.lstsq(design[fitted[inner]], height_um[fitted], rcond=None)
+    off = (height_um[inner] - design @ response)[~fitted[inner]]
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def _write_card(card: Path, best: str) -> Path:
+    """The card with the recipe as its ``process.level``; what else it says stays as it was written."""
+    recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
+    text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))
+    line = f'level = "{recipe.name}"'
+    if _PROCESS.search(text):
+        text = _PROCESS.sub(f"[process]\n{line}", text)
+    else:
+        text = f"{text.rstrip()}\n\n[process]\n{line}\n"
+    for path, content in ((recipe, f'name = "{best}"\n\n{RECIPES[best]}'), (target, text)):
+        with atomic_file(path) as temporary:
+            temporary.write_text(content, encoding="utf-8")
+    return target
+
+
+def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:
+    from litho_data.reports.page import Page
+
+    page = Page(
+        "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
+    )
+    page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
+    rows = [
+        {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
+    ]
+    caption = (
+        "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
+    )
+    page.table(rows, caption, "recipes.csv", digits=1)
+    _show(page, pictures)
+    page.write(folder)
+
+
+def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
+    from litho_data.reports.pictures import colour_bar_png, coloured_png, limits, thumbnail
+
+    rows, bar = [], colour_bar_png("cividis")
+    for name, images in pictures.items():
+        shown = []
+        for image in images:
+            shown.append(coloured_png(thumbnail(image), "cividis", *limits(image)))
+        rows.append((name, shown))
+    columns = [(title, bar) for title in ("raw", *RECIPES)]
+    page.gallery(columns, rows, "Heights before and after each recipe, every picture on a scale of its own.")

@@ -1,0 +1,189 @@
+"""Is a dataset good, and if not what is to be done: every number of the card against the heights."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from litho_data.cards.card import Card
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.making.right_layout import Print
+
+ALL = "all scans"
+# So many times the height that the layout says, or that the other prints have: a number is wrong.
+_TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
+# Scales of the scans that agree with each other but not with 1: the pitch of the card.
+_OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
+_LEAST_VALID = 0.5
+# Measured prints lie at 1.1 to 1.5, made ones with a rim as high as the substrate at 2, without it at 6 to 8.
+_EDGE_TIMES = 2.5
+_MOST_TRE_PX = 1.0
+# What levelling left, as a share of the print's own standard deviation.
+_LEFT = 0.3
+_SHOWN = 12
+
+
+class Weight(IntEnum):
+    """What comes first among the findings."""
+
+    LAYOUT = 0
+    PITCH = 1
+    HEIGHT = 2
+    SKIPPED = 3
+    NOTE = 4
+    LEVEL = 5
+    PLACE = 6
+
+
+class Finding(Record):
+    """One thing to do: the scan it is about, or all, and what speaks against it."""
+
+    scan: str
+    text: str
+    weight: int
+
+    def __str__(self) -> str:
+        return f"{self.scan}: {self.text}"
+
+
+def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
+    """Scans whose height per level is not of the size of the others', by id, with the reason."""
+    gains = {one.id: abs(one.response[0]) for one in prints}
+    if len(gains) < 3:
+        return {}
+    usual = float(np.median(list(gains.values())))
+    times = {name: gain / usual for name, gain in gains.items() if usual > 0}
+    return {
+        name: f"height per level {_shown(one)} that of the others: is its unit the right one?"
+        for name, one in times.items()
+        if not 1 / _ODD_SCAN < one < _ODD_SCAN
+    }
+
+
+def require_heights(prints: Sequence[Print], card: Card) -> None:
+    """Refuse a level height that has nothing to do with the prints, like a wavelength in nm.
+
+    Raises:
+        InputError: prints a hundred times as high as their layouts say, or as low.
+    """
+    times = _height_times(prints, card)
+    if times and not 1 / _IMPOSSIBLE < times < _IMPOSSIBLE:
+        height_um = card.layout.level_height_um
+        raise InputError(
+            "layout.level_height_um",
+            got=f"{height_um:g} µm, where the prints rise by {times * height_um:.3g} µm per level",
+            wanted="the height of one level in µm",
+            hint="or is scan.unit the wrong one?",
+        )
+
+
+def findings(
+    records: Sequence[Mapping[str, Any]],
+    prints: Sequence[Print],
+    doubts: Mapping[str, str],
+    skipped: Mapping[str, str],
+    card: Card,
+) -> list[Finding]:
+    """What is to be done, worst first; nothing for a good dataset.
+
+    Args:
+        records: of the dataset's scans.
+        prints: their heights at a few points.
+        doubts: what speaks against the layout of a scan, by id.
+        skipped: why a scan is not in the store, by id.
+        card: whose numbers are compared with the heights.
+    """
+    named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
+    named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
+    spread_nm = {one.id: 1e3 * float(np.nanstd(one.height)) for one in prints}
+    for record in records:
+        named += [(record["id"], text, weight) for text, weight in _of_a_scan(record, spread_nm)]
+    found = [
+        Finding(scan=name, text=text, weight=weight)
+        for name, text, weight in (*named, *_of_the_card(records, prints, card))
+    ]
+    return sorted(found, key=lambda one: (one.weight, one.scan != ALL, one.scan))
+
+
+def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
+    """What speaks against one scan, ``spread_nm`` being the standard deviation of its heights by id."""
+    quality = record["quality"]
+    for note in record.get("notes", ()):
+        yield note, Weight.NOTE
+    if quality.get("polarity") == -1:
+        yield "its heights fall where the levels rise: is the layout or the scan inverted?", Weight.LAYOUT
+    if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
+        text = f"details lie {off:.1f} px from their place: is it the right layout and pitch?"
+        yield text, Weight.PLACE
+    if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
+        yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
+    left = quality.get("sigma_levelling_nm", 0.0)
+    if left > _LEFT * spread_nm.get(record["id"], np.inf):
+        text = f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
+        yield text, Weight.LEVEL
+
+
+def _of_the_card(
+    records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
+) -> Iterator[tuple[str, str, Weight]]:
+    """Numbers of the card that all scans together contradict: the scan, or all, what, and how bad."""
+    layout = card.layout
+    times = _height_times(prints, card)
+    if times and not 1 / _TIMES < times < _TIMES:
+        text = (
+            f"the prints rise by {times * layout.level_height_um:.3g} µm per level, {_shown(times)} "
+            f"layout.level_height_um = {layout.level_height_um:g}: is that, or scan.unit, the right one?"
+        )
+        yield ALL, text, Weight.HEIGHT
+    scales = np.array([scale for one in records if (scale := _scale(one))])
+    usual = float(np.median(scales)) if len(scales) else 1.0
+    for one in records:
+        if (scale := _scale(one)) and abs(scale / usual - 1) > _ODD_SCALE:
+            percent = 100 * (scale / usual - 1)
+            text = f"its scale is {percent:+.1f} % off that of the others: is its size the right one?"
+            yield one["id"], text, Weight.PITCH
+    if abs(usual - 1) > _OFF and float(np.median(np.abs(scales - usual))) < _ALIKE:
+        text = (
+            f"the scans are {100 * (usual - 1):+.1f} % off in scale: layout.pitch_um = {layout.pitch_um:g} "
+            f"fits as {layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
+        )
+        yield ALL, text, Weight.PITCH
+    edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
+    if edge_times > _EDGE_TIMES:
+        text = (
+            f"their outermost pixels lie {edge_times:.0f} times as far from their layouts as the rest: set "
+            "write.surround to substrate if level 0 goes on around a field, else to unknown, which leaves "
+            "these pixels out"
+        )
+        yield ALL, text, Weight.LEVEL
+    highest = max((float(one.highest_level) for one in prints), default=layout.levels)
+    if 2 * highest < layout.levels - 1:
+        text = f"the layouts use no level above {highest:g}, layout.levels = {layout.levels}"
+        yield ALL, text, Weight.HEIGHT
+
+
+def _scale(record: Mapping[str, Any]) -> float:
+    """Stretch of a scan onto its layout; 0 if it was not registered."""
+    low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
+    return float(low * high) ** 0.5 if low * high > 0 else 0.0
+
+
+def _height_times(prints: Sequence[Print], card: Card) -> float:
+    """Height per level of the prints over that of the card; 0 where nothing is known."""
+    gains = [abs(one.response[0]) for one in prints]
+    return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0
+
+
+def _shown(times: float) -> str:
+    return f"{times:.3g} times" if times >= 1 else f"1/{1 / max(times, 1e-12):.3g} of"
+
+
+def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
+    """The first words of the report: good, or what is to be done, worst first."""
+    if not found:
+        return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
+    shown = " · ".join(str(one) for one in found[:_SHOWN])
+    more = f" · and {len(found) - _SHOWN} more in the table" if len(found) > _SHOWN else ""
+    return f"{n_scans} scans are in the store. To do, worst first — {shown}{more}"

@@ -1,0 +1,257 @@
+"""Self-contained HTML reports: a verdict, pictures, folded tables (also as CSV), and how they were made."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
+
+if TYPE_CHECKING:
+    import jinja2
+    import pandas as pd
+    from markupsafe import Markup
+    from matplotlib.figure import Figure
+
+    Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
+
+# Column of a table to its name for people and what it is; the CSV keeps the key.
+Words = Mapping[str, Sequence[str]]
+
+_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+# Columns that name a model get its colour.
+_OF_MODELS = {"model", "designed with", "arm", "judge"}
+# Columns that hold keys, which are spelt out like the names of columns.
+_OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
+
+
+class Page:
+    """A report under construction; parts appear in the order in which they are added.
+
+    Args:
+        title: what was done, on what.
+        lead: one line below it.
+        run: the run that made the result; by default the one that writes the page.
+        facts: what else identifies it, such as hashes and seeds, by name.
+        words: what columns of its tables are called, and what they mean, or the TOML file that says so;
+            others are spelt out from their key.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        lead: str = "",
+        run: RunFacts | None = None,
+        facts: Mapping[str, object] | None = None,
+        words: Words | Path | None = None,
+    ):
+        self.title = title
+        self.lead = lead
+        self._run = run
+        self._facts = dict(facts or {})
+        known = tomllib.loads(words.read_text(encoding="utf-8")) if isinstance(words, Path) else words
+        self._words: Words = known or {}
+        self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
+        self._tables: list[tuple[str, pd.DataFrame]] = []
+
+    def heading(self, text: str, folded: bool = False) -> None:
+        """Start a section; a folded one shows its heading only until it is opened."""
+        self._sections.append({"title": text, "folded": folded, "parts": []})
+
+    def verdict(self, text: str) -> None:
+        """The answer in plain words: what is best, by how much, and whether that is more than chance."""
+        self._add("verdict", text=text)
+
+    def paragraph(self, text: str) -> None:
+        """Plain prose."""
+        self._add("paragraph", text=text)
+
+    def note(self, *texts: str) -> None:
+        """What the reader must not overlook, in one box; without texts, none."""
+        if texts:
+            self._add("note", texts=texts)
+
+    def points(self, texts: Sequence[str]) -> None:
+        """A list of sentences."""
+        self._add("points", texts=list(texts))
+
+    def code(self, text: str) -> None:
+        """A fixed-width text."""
+        self._add("code", text=text)
+
+    def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:
+        """The few figures that matter most: (value with unit, label)."""
+        self._add("tiles", tiles=list(tiles))
+
+    def links(self, links: Sequence[tuple[str, str]]) -> None:
+        """Relative links: (target, text)."""
+        self._add("links", links=list(links))
+
+    def table(
+        self,
+        table: Table,
+        caption: str,
+        csv_name: str,
+        digits: int = 2,
+        columns: Sequence[str] | None = None,
+    ) -> None:
+        """A table that sorts; ``write`` also saves it at full precision as ``csv_name`` beside the page.
+
+        Args:
+            table: a frame, columns by name, or its rows: mappings or records. A record in a row has a column
+                for each of its fields, ``row_field``; an interval and a list are spelt out.
+            digits: places after the point; a smaller number keeps two figures.
+            columns: those to show, in this order; all by default.
+        """
+        frame = _frame(table, digits)
+        frame = frame if columns is None else frame.reindex(columns=list(columns))
+        shown = []
+        for key in map(str, frame.columns):
+            name, meaning = self._words.get(key, (spelt_out(key), ""))
+            shown.append({"name": name, "meaning": meaning, "numeric": frame[key].dtype.kind in "iufb"})
+        rows = [
+            [self._cell(value, digits, str(key)) for key, value in zip(frame.columns, row, strict=True)]
+            for row in frame.itertuples(index=False)
+        ]
+        meanings = [(column["name"], column["meaning"]) for column in shown if column["meaning"]]
+        self._add("table", caption=caption, csv=csv_name, columns=shown, rows=rows, meanings=meanings)
+        self._tables.append((csv_name, frame))
+
+    def figure(self, figure: Figure, caption: str) -> None:
+        """A matplotlib figure of :func:`new_figure`."""
+        self._add("figure", caption=caption, address=svg_address(figure))
+
+    def gallery(
+        self, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[str, Sequence[str]]], caption: str
+    ) -> None:
+        """Small pictures in rows and columns.
+
+        Args:
+            columns: title and colour bar of each.
+            rows: label and one picture per column, as of :func:`coloured_png`.
+            caption: below.
+        """
+        self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
+
+    def write(self, folder: str | Path, name: str = "report.html") -> Path:
+        """Write the page and its CSV tables into ``folder``; returns the path of the page."""
+        target = Path(folder)
+        for csv_name, frame in self._tables:
+            with atomic_file(target / csv_name) as temporary:
+                frame.to_csv(temporary, index=False)
+        run = self._run or RunFacts(**run_facts())
+        commit = run.commit + (" with changes" if run.dirty else "")
+        facts = self._facts | ({"commit": commit} if commit else {}) | run.versions
+        text = _template().render(
+            title=self.title,
+            lead=self.lead,
+            sections=self._sections,
+            command=run.command,
+            facts=facts.items(),
+            light=LIGHT,
+            dark=DARK,
+        )
+        with atomic_file(target / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        return target / name
+
+    def _cell(self, value: Any, digits: int, column: str) -> dict[str, Any]:
+        if isinstance(value, str):
+            colour = model_colour(value) if column in _OF_MODELS and " " not in value else None
+            name = self._words.get(value, (spelt_out(value), ""))[0] if column in _OF_KEYS else value
+            return {"text": name, "value": None, "colour": colour}
+        number = isinstance(value, (int, float)) and value == value and not isinstance(value, bool)
+        return {"text": _text(value, digits), "value": value if number else None, "colour": None}
+
+    def _add(self, kind: str, **part: Any) -> None:
+        self._sections[-1]["parts"].append({"kind": kind, **part})
+
+
+def _frame(table: Table, digits: int) -> pd.DataFrame:
+    import pandas as pd
+
+    if isinstance(table, (pd.DataFrame, Mapping)):
+        return pd.DataFrame(table)
+    return pd.DataFrame([dict(_cells(row, digits)) for row in table])
+
+
+def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Columns and values of a row, those of the records in it beside its own."""
+    for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
+        if isinstance(value, Mapping | BaseModel):
+            yield from _cells(value, digits, f"{prefix}{key}_")
+        elif isinstance(value, tuple) and len(value) == 2 and all(isinstance(end, float) for end in value):
+            yield prefix + key, " … ".join(f"{end:.{digits}f}" for end in value)
+        else:
+            yield prefix + key, ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+
+
+@cache
+def _template() -> jinja2.Template:
+    import jinja2
+
+    text = Path(__file__).with_name("page.html.jinja").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True)
+    environment.filters["whole_options"] = _whole_options
+    return environment.from_string(text)
+
+
+def filled(template: Path, **values: object) -> str:
+    """A page of text from its template (Jinja) and the values that the template names."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.from_string(template.read_text(encoding="utf-8")).render(values)
+
+
+def _whole_options(text: str) -> Markup:
+    """Options of commands in a sentence do not break over two lines."""
+    from markupsafe import Markup, escape
+
+    return Markup(
+        re.sub(r"(?<![\w-])--[a-z][a-z-]*", r'<span class="option">\g<0></span>', str(escape(text)))
+    )
+
+
+def capitalised(text: str) -> str:
+    """A text with a capital to begin with, the rest as it is."""
+    return text[:1].upper() + text[1:]
+
+
+def spelt_out(key: str) -> str:
+    """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
+    if "_" not in key:
+        return _SPELT["short"].get(key, key)
+    head, _, more = key.partition(" ")
+    if more and "_" in head:
+        return f"{spelt_out(head)}, {more}"
+    head, between, more = key.partition("_sd_between_")
+    if between:
+        return f"{spelt_out(head)}, standard deviation between {more}"
+    words, unit = key, ""
+    for suffix, text in _SPELT["units"].items():
+        if key.endswith(f"_{suffix}"):
+            words, unit = key.removesuffix(f"_{suffix}"), f" ({text})"
+            break
+    return " ".join(_SPELT["short"].get(word, word) for word in re.split("_+", words)) + unit
+
+
+def _text(value: Any, digits: int) -> str:
+    if value is None or (isinstance(value, float) and value != value):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        small = 0 < abs(value) < 10**-digits
+        return f"{value:.2g}" if small else f"{value:.{digits}f}"
+    return f"{value:,}" if isinstance(value, int) and abs(value) >= 10_000 else str(value)

@@ -1,0 +1,153 @@
+"""Pictures of reports: figures and maps, in colours for light and dark screens."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import re
+import zlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.kinds import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LIGHT = {
+    "paper": "#ffffff",
+    "ink": "#1c2430",
+    "soft": "#56616f",
+    "line": "#dfe4ea",
+    "band": "#f4f6f9",
+    "accent": "#0b6aa2",
+}
+DARK = {
+    "paper": "#13171d",
+    "ink": "#e6e9ee",
+    "soft": "#a7b1be",
+    "line": "#343d49",
+    "band": "#1d232b",
+    "accent": "#6cb8ea",
+}
+# One colour a model, on every page; each stands out from both papers (3:1, tests/test_report.py).
+_MODEL_COLOURS = {
+    "identity": "#868d98",
+    "none": "#868d98",
+    "affine": "#a87400",
+    "affine-mtf": "#b56b4c",
+    "blur-table": "#7d8a1d",
+    "linear": "#0e8f86",
+    "physics": "#c8502f",
+    "pbl": "#2f7fd0",
+    "fno": "#9a63c9",
+    "features": "#3a9142",
+    "random-features": "#cc4f8f",
+    "corrected": "#3a9142",
+}
+_FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87400")
+_PICTURE_DPI = 110
+_COLOURS = 255
+# Side of a map in a notebook.
+_NOTEBOOK_PX = 220
+_GAP = 255  # the last entry of the palette, transparent
+
+
+def model_colour(name: str) -> str:
+    """The colour of a model on every page: fixed for those of the project, else drawn from its name."""
+    known = _MODEL_COLOURS.get(name)
+    return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
+
+
+def new_figure(width_inch: float, height_inch: float) -> Figure:
+    """A figure outside pyplot's global state, so that reports never leak memory or need a display."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_inch, height_inch), layout="constrained")
+    FigureCanvasSVG(figure)
+    return figure
+
+
+def svg_address(figure: Figure) -> str:
+    """Data address of a figure as SVG; its black and white are the ink and paper of the screen's colours."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    buffer = io.StringIO()
+    figure.dpi = _PICTURE_DPI
+    # Not savefig, which lays out and draws everything twice.
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    text = buffer.getvalue()
+    for word in ("ink", "paper"):
+        text = re.sub(rf"{LIGHT[word]}\b", f"var(--{word})", text)
+    text = re.sub(r"#000000\b", "var(--ink)", text)
+    style = (
+        f"svg {{ --ink:{LIGHT['ink']}; --paper:{LIGHT['paper']}; fill:var(--ink) }} "
+        f"@media (prefers-color-scheme: dark) {{ svg {{ --ink:{DARK['ink']}; --paper:{DARK['paper']} }} }}"
+    )
+    text = text.replace("</style>", f"{style}</style>", 1)
+    return f"data:image/svg+xml;base64,{_base64(text.encode())}"
+
+
+def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
+    """Data address of an image in one of matplotlib's colour maps, transparent where it is NaN.
+
+    Args:
+        image: (ny, nx), one value per pixel of the picture.
+        colours: name of the colour map.
+        low: value of its first colour, ``high``: of its last; values outside get the nearest colour.
+    """
+    import matplotlib
+    from PIL import Image
+
+    shades = np.clip((image - low) / max(high - low, np.finfo(float).tiny), 0, 1) * (_COLOURS - 1)
+    indices = np.where(np.isfinite(shades), np.rint(np.nan_to_num(shades)), _GAP).astype(np.uint8)
+    palette = matplotlib.colormaps[colours](np.linspace(0, 1, _COLOURS), bytes=True)[:, :3]
+    picture = Image.fromarray(indices)
+    picture.putpalette([*palette.ravel().tolist(), 255, 255, 255])
+    buffer = io.BytesIO()
+    picture.save(buffer, format="png", compress_level=4, transparency=_GAP)
+    return f"data:image/png;base64,{_base64(buffer.getvalue())}"
+
+
+def limits(image: Array) -> tuple[float, float]:
+    """Lowest and highest value of a picture, a few outliers aside."""
+    low, high = np.nanpercentile(image, (0.5, 99.5))
+    return float(low), float(high)
+
+
+def thumbnail(image: Array, side_px: int = 180) -> Array:
+    """Every so many pixels of an image (ny, nx), at most this many along a side."""
+    step = max(1, -(-max(image.shape) // side_px))
+    return image[::step, ::step]
+
+
+def colour_bar_png(colours: str) -> str:
+    """The colours from low to high, one pixel high, to be stretched."""
+    return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
+
+
+def shown_html(line: str, **images: Array) -> str:
+    """What a notebook shows of an object with maps: the line of its ``repr``, and each map with its range.
+
+    Args:
+        line: the line.
+        images: maps (ny, nx) by what they show.
+    """
+    figures = []
+    for name, values in images.items():
+        image = np.where(np.isfinite(values), values, np.nan)
+        low, high = float(np.nanmin(image)), float(np.nanmax(image))
+        png = coloured_png(thumbnail(image, _NOTEBOOK_PX), "viridis", low, high)
+        caption = f"{name.replace('_um', ', µm').replace('_', ' ')}: {low:.3g} … {high:.3g}"
+        figures.append(
+            f'<figure style="display:inline-block;margin:.3em"><img src="{png}" alt="{name}" '
+            f'style="width:{_NOTEBOOK_PX}px"><figcaption>{caption}</figcaption></figure>'
+        )
+    return f"<p>{html.escape(line)}</p>{''.join(figures)}"
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()

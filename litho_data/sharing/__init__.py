@@ -1,0 +1,1 @@
+"""Independent jobs shared among processes and machines."""

@@ -1,0 +1,294 @@
+"""Independent jobs in this process, in local processes, or on a Dask cluster, a few at a time."""
+
+import asyncio
+import os
+import pickle
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import NamedTuple, TypeVar
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_facts, software_record
+from litho_data.sharing.sending import Away, Known, received, sent
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+# What the numerical libraries read when they are loaded; a Dask worker has these values too.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_CONNECT_S = 5.0
+_TRIES = 3
+
+
+class Pool(NamedTuple):
+    """Workers that take jobs: how many there are now, and the errors of a job lost with its worker.
+
+    ``tries``: how often a job is begun, ``restart``: called before those that were lost are begun again.
+    """
+
+    submit: Callable[..., Future[bytes]]
+    present: Callable[[], int]
+    lost: tuple[type[BaseException], ...]
+    fate: str
+    tries: int = 1
+    restart: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run. With as many threads in each process the results are the same, to the bit.
+
+    Attributes:
+        processes: local ones, of one thread unless the environment says otherwise; 1 is this process.
+        dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
+        known: what jobs hold and need not be sent.
+        pool: see ``kept_open``.
+    """
+
+    processes: int = 1
+    dask: str | None = None
+    known: Known | None = None
+    pool: Pool | None = None
+
+    def __post_init__(self) -> None:
+        if self.processes < 1:
+            raise InputError("workers", got=self.processes, wanted="1 or more")
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether jobs leave this process."""
+        return self.dask is not None or self.processes > 1
+
+
+HERE = Workers()
+
+
+def run_jobs(
+    function: Callable[[J], R],
+    jobs: Sequence[J],
+    workers: Workers = HERE,
+    *,
+    name: Callable[[J], str] = str,
+    apart: bool = False,
+) -> Generator[tuple[J, R], None, None]:
+    """Each job with its result, in the order in which they are finished.
+
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
+    worker died is run again, alone, twice at most; Dask does so as often as its scheduler allows.
+
+    Args:
+        function: importable by name; jobs and results can be pickled.
+        name: what messages call a job.
+        apart: the function waits for a process of its own, so that threads will do for local workers.
+
+    Raises:
+        InputError: no scheduler at the address, a worker of other software or with several threads, or a job
+            whose worker died.
+    """
+    if not workers.elsewhere or len(jobs) < (1 if workers.dask else 2):
+        yield from ((job, function(job)) for job in jobs)
+        return
+    known = workers.known or Known(dict, {})
+    names = {id(one): key for key, one in known.objects.items()}
+    software = software_record() if workers.dask else None
+    away = Away(function, pickle.dumps(known.make), os.getcwd(), run_facts()["command"], software)
+    with nullcontext(workers.pool) if workers.pool else _opened(workers, apart, len(jobs)) as pool:
+        for number, answer in _tried(
+            lambda one: pool.submit(away, sent(jobs[one], names)),
+            len(jobs),
+            pool,
+            lambda one: name(jobs[one]),
+        ):
+            yield jobs[number], received(answer, known.objects)
+
+
+def _tried(
+    submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
+) -> Iterator[tuple[int, R]]:
+    """The numbers of jobs with their answers; those lost with a worker are tried again, one by one."""
+    tries: Counter[int] = Counter()
+
+    def begin(number: int) -> Future[R]:
+        try:
+            future = submit(number)
+        except pool.lost as error:
+            future = Future()
+            future.set_exception(error)
+        else:
+            tries[number] += 1
+        return future
+
+    batches = [list(range(count))]
+    while batches:
+        lost: list[int] = []
+        for number, future in _windowed(begin, batches.pop(0), pool.present):
+            try:
+                answer = future.result()
+            except pool.lost as error:
+                if tries[number] >= pool.tries:
+                    raise InputError(
+                        f"the worker of {name(number)}",
+                        got=pool.fate,
+                        hint="run it again, it resumes; should memory have run out, with fewer or larger "
+                        "workers",
+                    ) from error
+                lost.append(number)
+            else:
+                yield number, answer
+        if lost:
+            under_way = [number for number in lost if tries[number]]
+            print(f"a worker died: {', '.join(map(name, under_way))} again, alone", file=sys.stderr)
+            pool.restart()
+            waiting = [number for number in lost if not tries[number]]
+            batches = [*([number] for number in under_way), waiting, *batches]
+
+
+@contextmanager
+def kept_open(workers: Workers) -> Iterator[Workers]:
+    """The same workers, started once for all the jobs of a block; those that cannot be had are told at once.
+
+    Raises:
+        InputError: no scheduler at the address, or no worker there.
+    """
+    if not workers.elsewhere:
+        yield workers
+        return
+    with _opened(workers) as pool:
+        yield replace(workers, pool=pool)
+
+
+def _windowed(
+    submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
+) -> Iterator[tuple[J, Future[R]]]:
+    """Jobs as they are finished, two for each of ``count()`` workers under way."""
+    waiting = iter(jobs)
+    running: dict[Future[R], J] = {}
+
+    def fill() -> None:
+        room = 2 * max(1, count()) - len(running)
+        running.update({submit(job): job for job in islice(waiting, max(0, room))})
+
+    fill()
+    while running:
+        done = wait(running, return_when=FIRST_COMPLETED).done
+        finished = [(running.pop(future), future) for future in done]
+        fill()
+        yield from finished
+
+
+def _opened(workers: Workers, apart: bool = False, most: int | None = None) -> AbstractContextManager[Pool]:
+    if workers.dask is not None:
+        return _dask(workers.dask)
+    return _local(min(workers.processes, most or workers.processes), apart)
+
+
+@contextmanager
+def _local(count: int, apart: bool) -> Iterator[Pool]:
+    from multiprocessing import get_context
+
+    def opened() -> Executor:
+        if apart:
+            return ThreadPoolExecutor(count)
+        # Spawned, because a forked copy of a process with threads may hang.
+        return ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
+
+    def restart() -> None:
+        executors.pop().shutdown(wait=False)
+        executors.append(opened())
+
+    executors = [opened()]
+    before = os.environ.copy()
+    os.environ.update({**ONE_THREAD, **before})
+    try:
+        yield Pool(
+            lambda *job: executors[0].submit(*job),
+            lambda: count,
+            (BrokenProcessPool,),
+            f"died {_TRIES} times",
+            _TRIES,
+            restart,
+        )
+    finally:
+        executors[0].shutdown(wait=apart, cancel_futures=True)
+        for variable in ONE_THREAD.keys() - before.keys():
+            del os.environ[variable]
+
+
+def _die_with_parent() -> None:
+    """Workers of a killed parent would otherwise wait forever for their next job."""
+    from multiprocessing import parent_process
+
+    def watch() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client, KilledWorker
+    except ImportError as error:
+        raise InputError("dask", got="not installed", wanted="pip install 'litholoop[cluster]'") from error
+    try:
+        _require_scheduler(address)
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, MemoryError) as error:
+        # MemoryError: another program answers there, and its words are taken for sizes.
+        said = str(error) or f"no answer in {_CONNECT_S:g} s"
+        raise InputError(
+            "Dask scheduler", got=f"none at {address} ({said})", wanted="for example tcp://host:8786"
+        ) from error
+
+    def count() -> int:
+        try:
+            return len(client.nthreads())
+        except OSError:  # the jobs under way tell that the scheduler is gone
+            return 0
+
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_CONNECT_S)
+        except TimeoutError as error:
+            raise InputError(f"Dask scheduler {address}", got="no workers", wanted="at least one") from error
+        executor = client.get_executor(pure=False)
+        try:
+            yield Pool(
+                executor.submit,
+                count,
+                (KilledWorker, CancelledError),
+                "died, as did those that took its place, or Dask's scheduler",
+            )
+        finally:
+            executor.shutdown(wait=False)
+
+
+def _require_scheduler(address: str) -> None:
+    """Ask who is there: a client that meets another program waits long, and its end is a traceback."""
+    from distributed.core import rpc
+
+    async def ask() -> None:
+        async with rpc(address) as scheduler:
+            await asyncio.wait_for(scheduler.identity(), _CONNECT_S)
+
+    # In a thread of its own: a notebook has a loop already.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, ask()).result()

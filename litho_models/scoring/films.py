@@ -1,0 +1,78 @@
+"""Films against films: how much area differs, and which features are lost, too many, or joined.
+
+A feature is a connected part of the film or of the ground within it, of at least four pixels, cut at half the
+film's height.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from litho_data.store import PrintedScan
+
+_LEAST_PX = 4
+FILMS_TEXT = (
+    "area_error is the difference of the predicted and the measured area of the film, without sign. Features "
+    "are connected parts of film or ground of at least four pixels: missing are measured ones without any "
+    "pixel in the prediction, extra are predicted ones without any in the measurement, merged counts films "
+    "that the prediction joins and the measurement does not, or the reverse."
+)
+
+
+class FilmErrors(NamedTuple):
+    """``area_error_percent`` of the measured area, None without any; the rest are counts of features."""
+
+    area_error_percent: float | None
+    missing: int
+    extra: int
+    merged: int
+
+
+def films_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> FilmErrors:
+    """Film of a scan freed of its nuisances against that of its prediction."""
+    return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
+
+
+def film_edge_um(scan: PrintedScan) -> float:
+    """Half the height of the film, µm."""
+    return (scan.levels - 1) * scan.level_height_um / 2
+
+
+def film_errors(measured_um: np.ndarray, expected_um: np.ndarray, edge_um: float) -> FilmErrors:
+    """Compare two films.
+
+    Args:
+        measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape, all numbers.
+        edge_um: height of their edge.
+    """
+    known = np.isfinite(measured_um)
+    measured, expected = (known & (one > edge_um) for one in (measured_um, expected_um))
+    film, ground = _partners(measured, expected), _partners(known & ~measured, known & ~expected)
+    missing, extra = (sum(int((kind[side] == 0).sum()) for kind in (film, ground)) for side in (0, 1))
+    area = int(measured.sum())
+    return FilmErrors(
+        area_error_percent=100 * abs(int(expected.sum()) - area) / area if area else None,
+        missing=missing,
+        extra=extra,
+        merged=sum(int(np.maximum(counts - 1, 0).sum()) for counts in film),
+    )
+
+
+def _partners(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many parts of the other each part of one touches, for the parts of either that are large enough."""
+    from scipy.ndimage import label
+
+    labels = [label(one)[0] for one in (first, second)]
+    large = [np.bincount(one.ravel())[1:] >= _LEAST_PX for one in labels]
+    both = (labels[0] > 0) & (labels[1] > 0)
+    pairs = np.unique(np.stack([one[both] for one in labels]), axis=1) - 1
+    real = large[0][pairs[0]] & large[1][pairs[1]]
+    touched = [np.bincount(own, minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
+    counted = [np.bincount(own[real], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
+    # One that touches small parts only has a partner, but joins nothing.
+    found = [
+        np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
+    ]
+    return found[0][large[0]], found[1][large[1]]

@@ -1,0 +1,156 @@
+"""Electron micrographs: edges to a fraction of a pixel, whatever rims, charging and dirt do."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import zarr
+from scipy.ndimage import gaussian_filter
+
+from litho_data import build_dataset, open_store
+from litho_data.cards.card import check_card
+from litho_data.cards.listing import list_fields
+from litho_data.foundation.errors import InputError
+from litho_data.making.contour import coverage, find_edges, foreign
+from litho_data.provenance.verify import verify
+
+RADIUS_PX = 60.0
+CARD = """
+name = "films"
+[layout]
+files = "layout/{id}.png"
+pitch_um = 0.004
+average_px = 4
+levels = 17
+level_height_um = 0.01
+[scan]
+files = "sem/{id}.png"
+instrument = "sem"
+size_um = [0.48, 0.56]
+[write]
+surround = "unknown"
+"""
+
+
+def _from_centre(shape: tuple[int, int]) -> np.ndarray:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return RADIUS_PX - np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2)
+
+
+def _micrograph(distance_px: np.ndarray, charging: float = 0.2) -> np.ndarray:
+    """What a microscope makes of a film: a flank one pixel wide, a rim, charging along x, noise."""
+    film = 1 / (1 + np.exp(-distance_px / 0.5))
+    grey = 70 + film * (70 + 60 * np.exp(-np.maximum(distance_px, 0) / 12))
+    grey *= 1 + charging * np.linspace(-1, 1, distance_px.shape[1])
+    noise = np.random.default_rng(1).normal(0, 3, distance_px.shape)
+    return np.clip(grey + noise, 0, 255).astype(np.uint8)
+
+
+def test_rim_and_charging_do_not_move_an_edge() -> None:
+    distance = _from_centre((200, 260))
+    found = find_edges(_micrograph(distance)).distance_px
+    near = np.abs(distance) < 4
+    off = (found - distance)[near]
+    # Noise 3 on a flank of 110 in 2 px, smoothed: 0.03 px; a rim of 1.6 times the film: 0.3 px.
+    assert off.std() < 0.06
+    assert abs(off.mean()) < 0.3
+
+
+def test_coverage_keeps_the_area_of_a_disc_at_any_pitch() -> None:
+    distance = _from_centre((201, 201))
+    for every in (1, 2, 4):
+        share = coverage(distance[::every, ::every], every)
+        # A pixel crossed at an angle is wrong by at most an eighth, with either sign around the disc.
+        assert share.sum() * every**2 == pytest.approx(np.pi * RADIUS_PX**2, rel=2e-3)
+
+
+def test_dirt_is_film_where_none_can_be_and_a_lost_island_is_print() -> None:
+    layout = np.zeros((80, 80))
+    layout[:, 40:] = 1
+    layout[10:24, 10:24] = 1
+    seen = layout.copy()
+    seen[10:24, 10:24] = 0
+    seen[50:56, 15:21] = 1
+    dirt = foreign(seen, layout, 5)
+    assert dirt[50:56, 15:21].all()
+    assert not dirt[:44].any()
+
+
+def test_specks_are_passed_over() -> None:
+    distance = _from_centre((200, 260))
+    grey = _micrograph(distance, 0)
+    grey[10:14, 10:14] = 200
+    edges = find_edges(grey)
+    assert edges.specks[10:14, 10:14].all()
+    assert (edges.distance_px[:20, :20] < 0).all()
+
+
+def test_a_picture_without_edges_is_refused() -> None:
+    with pytest.raises(InputError, match="no edge"):
+        find_edges(np.full((64, 64), 90, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("size_um = [0.48, 0.56]|", "size_um"),
+        ('size_um = [0.48, 0.56]|size_um = [0.48, 0.56]\nunit = "nm"', "a micrograph has none"),
+        ("[write]|[process]\ntip = 0.1\n[write]", "no levelling, tip"),
+        ("levels = 17|levels = 16", "levels = 17"),
+        ('"sem"\n|"tem"\n', "instrument"),
+    ],
+)
+def test_a_card_that_contradicts_its_instrument_is_refused(change: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        check_card(tomllib.loads(CARD.replace(*change.split("|"))), "card")
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A film: a layout of 1 nm pixels, a print with rounded corners, a micrograph of 2 nm pixels."""
+    folder = tmp_path_factory.mktemp("films")
+    (folder / "card.toml").write_text(CARD, encoding="utf-8")
+    for name in ("layout", "sem"):
+        (folder / name).mkdir()
+    layout = gaussian_filter(np.random.default_rng(1).normal(size=(480, 560)), 20) > 0
+    printed = gaussian_filter(layout.astype(float), 10) - 0.5
+    distance_px = printed / np.maximum(np.hypot(*np.gradient(printed)), 1e-3) / 2
+    grey = _micrograph(distance_px.reshape(240, 2, 280, 2).mean(axis=(1, 3)))
+    cv2.imwrite(str(folder / "layout/F1.png"), layout.astype(np.uint8) * 255)
+    cv2.imwrite(str(folder / "sem/F1.png"), grey)
+    build_dataset(folder / "card.toml", folder / "films.zarr")
+    return folder
+
+
+def test_a_film_is_built_into_a_store_that_says_what_its_heights_are(films: Path) -> None:
+    store = open_store(films / "films.zarr")
+    assert store.instrument == "sem"
+    scan = store.scan("F1")
+    assert scan.seen_by == "sem"
+    inner = scan.height_um[scan.valid]
+    assert inner.min() >= 0
+    assert inner.max() == pytest.approx(0.16)
+    # Registered: the film lies on its layout but for a rim of a few pixels.
+    wrong = (scan.height_um > 0.08) != (scan.layout_um > 0.08)
+    assert wrong[scan.valid].mean() < 0.05
+    assert np.isfinite(scan.height_sigma_um[scan.valid]).all()
+    assert store.quality["edge_sigma_nm"].between(0.01, 0.5).all()
+
+
+def test_a_film_store_is_verified_and_its_instrument_is_part_of_it(films: Path, tmp_path: Path) -> None:
+    assert not verify(films / "films.zarr").findings
+    copy = tmp_path / "films.zarr"
+    shutil.copytree(films / "films.zarr", copy)
+    zarr.open_group(copy, mode="r+", use_consolidated=False).attrs["instrument"] = "afm"
+    assert open_store(copy).sha256 != open_store(films / "films.zarr").sha256
+
+
+@pytest.mark.measured
+def test_the_card_of_the_silicon_patterns_finds_all_of_them() -> None:
+    card = Path(__file__).parents[2] / "datasets" / "prefab-soi.toml"
+    assert len(list_fields(card).fields) == 14

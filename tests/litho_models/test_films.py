@@ -1,0 +1,156 @@
+"""Films: edges, area and features as closed forms, and an electron-beam printer made of parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from litho_data.store import PrintedScan
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.fitting.small_models import fit_small_model
+from litho_models.models import build_model
+from litho_models.models.parts import etch, hill, illuminate, project
+from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.films import film_errors
+from litho_models.scoring.records import Prediction
+from litho_models.scoring.scores import score_model
+from tests.litho_models.prints import make_scans, write_store
+
+FILM_UM, PITCH_UM = 0.22, 0.004
+GEOMETRY = {"pitch_um": PITCH_UM, "levels": 17, "level_height_um": FILM_UM / 16}
+
+
+def _disc(radius_px: float, size_px: int = 96) -> np.ndarray:
+    y, x = np.mgrid[:size_px, :size_px] - (size_px - 1) / 2
+    return (FILM_UM * np.clip(0.5 + radius_px - np.hypot(y, x), 0, 1)).astype(np.float32)
+
+
+def _scan(height_um: np.ndarray, **fields: object) -> PrintedScan:
+    level = np.rint(16 * height_um / FILM_UM).astype(np.uint8)
+    own = {"id": "F1", "print_id": "F", "order": 0, "mask_level": level, "height_um": height_um}
+    rest = {"valid": np.ones(level.shape, bool), "scan_to_layout": np.eye(3), "seen_by": "sem"}
+    return PrintedScan(**{**own, **rest, **GEOMETRY, **fields})
+
+
+def test_a_disc_that_is_too_large_is_off_by_the_difference_of_radii() -> None:
+    scores = score_model(
+        "m", [_scan(_disc(30))], [Prediction(_disc(31.5))], NuisanceProtocol.of_policy("none")
+    )
+    # Contours of coverage are those of the disc to a twentieth of a pixel.
+    assert scores.leading_nm == scores.edge_mean_nm == pytest.approx(1e3 * 1.5 * PITCH_UM, abs=0.05 * 4)
+    # Whole pixels are counted: a circle of 30 px is right to some 10 of 2,800.
+    assert scores.metrics["area_error_percent"] == pytest.approx(100 * (31.5**2 / 30**2 - 1), abs=0.8)
+    assert scores.metrics["features_missing"] == scores.metrics["features_merged"] == 0
+    assert scores.ssim is None
+
+
+def test_only_films_have_the_figures_of_films() -> None:
+    scan = replace(_scan(_disc(30)), seen_by="afm")
+    scores = score_model("m", [scan], [Prediction(_disc(31))], NuisanceProtocol.of_policy("offset"))
+    assert scores.leading_nm == scores.mae_datum_free_nm
+    assert not scores.metrics
+
+
+def test_features_are_counted_as_lost_too_many_and_joined() -> None:
+    measured = np.zeros((60, 60))
+    measured[10:20, 10:20] = measured[10:20, 24:34] = measured[40:45, 40:45] = 1
+    measured[30:50, 5:25] = 1
+    expected = measured.copy()
+    expected[40:45, 40:45] = 0  # an island lost
+    expected[14:16, 20:24] = 1  # two islands joined
+    expected[38:42, 12:16] = 0  # a hole too many
+    expected[55, 55] = 1  # a dot that is no feature
+    found = film_errors(measured, expected, 0.5)
+    assert (found.missing, found.extra, found.merged) == (1, 1, 1)
+    assert film_errors(expected, measured, 0.5)[1:] == (1, 1, 1)
+    assert film_errors(measured, measured, 0.5) == (0, 0, 0, 0)
+
+
+def test_a_spot_of_parts_is_the_sum_of_its_parts() -> None:
+    torch.manual_seed(0)
+    pattern = torch.rand(1, 1, 80, 80)
+    widths = torch.tensor([0.008, 0.02])
+    both = illuminate(pattern, [(0.7, widths[0]), (0.3, widths[1])], PITCH_UM, 20)
+    alone = [illuminate(pattern, [(1.0, width)], PITCH_UM, 20) for width in widths]
+    assert torch.allclose(both, 0.7 * alone[0] + 0.3 * alone[1], atol=1e-6)
+
+
+def test_resists_are_monotonic_and_known_at_their_threshold() -> None:
+    dose, threshold = torch.linspace(0, 1, 50), torch.tensor(0.4)
+    for resist in (hill(dose, torch.tensor(5.0), threshold), project(dose, torch.tensor(5.0), threshold)):
+        assert (resist.diff() > 0).all()
+    assert float(hill(threshold, torch.tensor(5.0), threshold)) == pytest.approx(0.5)
+    ends = project(torch.tensor([0.0, 1.0]), torch.tensor(5.0), threshold)
+    assert ends.tolist() == pytest.approx([0, 1], abs=1e-6)
+
+
+@pytest.mark.parametrize("bias_px", [-1.5, 0.0, 1.0])
+def test_etching_moves_an_edge_by_its_bias_whatever_the_slope_of_the_resist(bias_px: float) -> None:
+    x = torch.arange(60.0)
+    for width in (4.0, 8.0):
+        resist = torch.sigmoid((x - 30) / width).expand(1, 1, 8, 60)
+        film = etch(resist, 0.5, bias_px * PITCH_UM, PITCH_UM)[0, 0, 0].numpy()
+        edge = 1 + float(np.interp(0.5, film, np.arange(len(film))))
+        # The slope is that at the pixel, not at the edge: bias³ / 6 width², 0.04 px, and a pixel's curvature.
+        assert edge == pytest.approx(30 - bias_px, abs=0.1)
+
+
+def test_the_spot_of_a_printer_rounds_corners_and_a_blurred_edge_stays_where_it_is() -> None:
+    model = build_model("e-beam", spots=1, resist="threshold", diffusion=False, etch_bias=False, **GEOMETRY)
+    layout = torch.zeros(1, 1, 120, 120)
+    layout[..., 40:80, 40:80] = FILM_UM
+    with torch.no_grad():
+        film = model(layout)[0, 0].numpy()
+    assert film[60, 40] > FILM_UM / 2 > film[60, 39]
+    assert film[40, 40] < FILM_UM / 2
+
+
+def test_a_fit_finds_the_spot_the_threshold_and_the_bias_of_a_film() -> None:
+    parts = {"spots": 1, "resist": "threshold", "diffusion": False}
+    true = build_model("e-beam", forward_um=0.016, threshold=0.45, **parts, **GEOMETRY)
+    with torch.no_grad():
+        true.raw_bias_um.copy_(true.ranges["raw_bias_um"].raw(0.002))
+    level = 16 * (gaussian_filter(np.random.default_rng(0).normal(size=(2, 128, 128)), (0, 5, 5)) > 0)
+    scans = []
+    for number, one in enumerate(level.astype(np.uint8)):
+        scan = _scan(np.zeros(one.shape, np.float32), mask_level=one, id=f"F{number}")
+        with torch.no_grad():
+            height = true(torch.from_numpy(scan.layout_um)[None, None])[0, 0].numpy()
+        scans.append(replace(scan, height_um=height))
+    found = build_model("e-beam", forward_um=0.02, **parts, **GEOMETRY)
+    fit_small_model(found, scans, "none")
+    # Without noise the fit ends where a step gains less than 1e-4 of the error, which is next to nothing.
+    for name, value in true.values.items():
+        assert float(found.values[name]) == pytest.approx(float(value), rel=0.03, abs=2e-4), name
+
+
+def test_defaults_of_models_follow_the_pitch_of_another_printer() -> None:
+    first, other = (build_model("features", pitch_um=pitch).config for pitch in (0.1, 0.004))
+    assert other.sigmas_um == pytest.approx([0.04 * one for one in first.sigmas_um])
+    near = build_model("features", pitch_um=0.2).config
+    assert near.sigmas_um == first.sigmas_um
+    network = build_model("pbl", pitch_um=0.004).config.surroundings
+    assert network is not None
+    assert max(network.shifts_um) == pytest.approx(0.04)
+
+
+def test_a_benchmark_of_films_is_led_by_their_edges(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "films.zarr", make_scans(6, 64, datum_um=0.0), instrument="sem")
+    result = benchmark(store, tmp_path / "out", models=("identity", "blur-table"), folds=2)
+    assert (result.nuisance.policy, result.nuisance.background) == ("none", "none")
+    assert result.training["blur-table"]["nuisance"] == "none"
+    identity, blurred = result.scores
+    assert identity.seen_by == "sem"
+    assert identity.edge_mean_nm is not None
+    assert blurred.edge_mean_nm is not None
+    shift = identity.edge_mean_nm - blurred.edge_mean_nm
+    assert result.paired[0].mean_nm == pytest.approx(shift)
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "mean error of the edges over" in page
+    assert "features missing" in page
+    assert "Noise that no model" not in page

@@ -1,0 +1,73 @@
+"""Tables and bars show the figures of the record, and the law that says so sees a swapped column."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from litho_design.reports.parts import level_table
+from litho_models.evaluation.plots import error_bars
+from litho_models.evaluation.results import Benchmark
+from tests.tables import require_tables_equal_record
+
+PUBLISHED = Path(__file__).parents[1] / "docs" / "results" / "neural-lithography"
+RECORD = {
+    "name": "prints",
+    "rows": [
+        {"scan": "P11", "mae_nm": 1.5, "ci95_nm": [1.04, 2.0], "by": {"x": 3.0}},
+        {"scan": "P12", "mae_nm": 2.5, "ci95_nm": None, "by": {"x": 4.0}},
+    ],
+}
+TABLES = {
+    "name,scan,mae_nm,ci95_nm\nprints,P11,1.5,1.04 … 2.00\nprints,P12,2.5,–\n": "",
+    "scan,x\nP11,3.0\nP12,4.0\n": "",
+    "scan,error\nP11,1.5\n": "are no fields",
+    "scan,mae_nm\nP11,2.5\n": "row 0",
+    "scan,x\nP11,3.0\nP12,3.0\n": "row 1",
+    "scan,ci95_nm\nP11,1.05 … 2.00\n": "row 0",
+}
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_figure_in_another_row_or_column_is_seen(table: str, tmp_path: Path) -> None:
+    (tmp_path / "record.json").write_text(json.dumps(RECORD))
+    (tmp_path / "table.csv").write_text(table)
+    if not TABLES[table]:
+        require_tables_equal_record(tmp_path, "record.json", {})
+        return
+    with pytest.raises(AssertionError, match=TABLES[table]):
+        require_tables_equal_record(tmp_path, "record.json", {})
+    require_tables_equal_record(tmp_path, "record.json", {}, pivoted=("table.csv",))
+
+
+def test_waves_of_a_level_count_from_the_printed_level_0() -> None:
+    design: Any = SimpleNamespace(
+        stroke=SimpleNamespace(printed_height_um=[0.2, 0.3, 0.5]),
+        layout=SimpleNamespace(level_height_um=0.15),
+        optics=SimpleNamespace(wave_height_um=0.5),
+    )
+    table = level_table(design)
+    assert list(table["level"]) == [0, 1, 2]
+    assert table["nominal_um"] == pytest.approx([0, 0.15, 0.3])
+    assert table["printed_um"] == [0.2, 0.3, 0.5]
+    assert table["printed_waves"] == pytest.approx([0, 0.2, 0.6])
+
+
+@pytest.mark.pictures
+def test_the_interval_at_a_bar_is_that_of_its_error() -> None:
+    scores = Benchmark.read(PUBLISHED / "benchmark.json").scores
+    (axes,) = error_bars(scores, None, False).axes
+    bars, intervals = (
+        [one for one in axes.containers if type(one).__name__ == name]
+        for name in ("BarContainer", "ErrorbarContainer")
+    )
+    for kind, drawn, shown in zip(("mae_abs", "leading"), bars, intervals, strict=True):
+        assert [one.get_width() for one in drawn] == [getattr(one, f"{kind}_nm") for one in scores]
+        (lines,) = shown.lines[2]
+        ends = np.array([segment[:, 0] for segment in lines.get_segments()])
+        np.testing.assert_allclose(ends, [getattr(one, f"{kind}_ci95_nm") for one in scores], rtol=1e-12)
