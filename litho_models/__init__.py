@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
     from litho_models.frozen.files import load_frozen as load_frozen
-    from litho_models.frozen.files import push as push
     from litho_models.frozen.files import save_frozen as save_frozen
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator

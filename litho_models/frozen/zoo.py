@@ -34,7 +34,8 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
     if name == BEST and known:
         name = min(known, key=lambda one: _held_out_nm(Path(root) / one))
     if name not in known:
-        raise unknown_name("zoo model", name, [*known, BEST], "" if known else "`make zoo` trains it")
+        names = [*known, BEST] if known else []
+        raise unknown_name("zoo model", name, names, "" if known else "`make zoo` trains it")
     return Path(root) / name
 
 

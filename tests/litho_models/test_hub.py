@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_models import build_model, load_frozen, push, save_frozen
+from litho_models import build_model, load_frozen, save_frozen
+from litho_models.frozen.files import push
 
 
 @pytest.fixture
