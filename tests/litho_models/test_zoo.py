@@ -146,7 +146,7 @@ def test_unknown_names_and_paths_are_refused(small_zoo):
     for name in ("resnet", "../pbl", ""):
         with pytest.raises(InputError, match="fno, pbl, physics, best"):
             zoo.folder(name, small_zoo)
-        with pytest.raises(InputError, match="affine, .*, random-features, best"):
+        with pytest.raises(InputError, match=r"affine, .*, random-features, best"):
             load_frozen(f"zoo:{name}")
 
 
