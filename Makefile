@@ -13,7 +13,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
 
-.PHONY: help setup demo trials gap docs test test-fast test-cpus check check-all format release clean
+.PHONY: help setup demo trials gap zoo docs test test-fast test-cpus check check-all format release clean
 
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
@@ -36,6 +36,9 @@ trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PU
 gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [CORRECTED=DIR] [PUBLISH=1]
 	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(DASK),--dask $(DASK)) $(if $(CORRECTED),--corrected $(CORRECTED)) \
 		$(if $(PUBLISH),--publish)
+
+zoo: $(STAMP)      ## train the models that ship with the package, an hour: make zoo, or make zoo MODELS=pbl,fno
+	$(BIN)/python -m benchmarks.zoo $(OUT)/zoo $(if $(MODELS),--models $(MODELS))
 
 docs: $(DOCS_STAMP) ## build the site of the documentation into runs/site; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

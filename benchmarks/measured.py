@@ -46,17 +46,22 @@ PAGES = {
 
 def texts(folder: Path) -> dict[str, str]:
     """The text of each mark, from the result files in a folder."""
-
-    def found(file: str) -> dict[str, Any]:
-        return json.loads((folder / file).read_text(encoding="utf-8"))
-
-    networks = in_one(found("benchmark.json"), found("benchmark_pbl.json"))
-    benchmark, noise = in_one(networks, found("benchmark_least_squares.json")), found("noise.json")
+    benchmark, noise = in_table(folder), _found(folder, "noise.json")
     return {
         "headline": headline_table(benchmark, noise),
         "benchmark": benchmark_table(benchmark, noise),
         "noise": noise_table(noise),
     }
+
+
+def in_table(folder: Path) -> dict[str, Any]:
+    """The benchmark that the table shows: each model as it was made last."""
+    networks = in_one(_found(folder, "benchmark.json"), _found(folder, "benchmark_pbl.json"))
+    return in_one(networks, _found(folder, "benchmark_least_squares.json"))
+
+
+def _found(folder: Path, file: str) -> dict[str, Any]:
+    return json.loads((folder / file).read_text(encoding="utf-8"))
 
 
 def main() -> None:

@@ -41,9 +41,6 @@ PROCESSORS = {
             "ONEDNN_MAX_CPU_ISA": "AVX2",
             "ATEN_CPU_CAPABILITY": "avx2",
             "OPENBLAS_CORETYPE": "Haswell",
-            "NUMBA_CPU_NAME": "haswell",
-            # Else Numba takes the features of this processor under the name of the other.
-            "NUMBA_CPU_FEATURES": "",
         },
         ("avx512_f", "avx_ne_convert"),
     ),
@@ -54,8 +51,6 @@ PROCESSORS = {
             "ONEDNN_MAX_CPU_ISA": "AVX512_CORE",
             "ATEN_CPU_CAPABILITY": "avx512",
             "OPENBLAS_CORETYPE": "SkylakeX",
-            "NUMBA_CPU_NAME": "skylake-avx512",
-            "NUMBA_CPU_FEATURES": "",
         },
         ("avx512_bf16", "amx_bf16"),
     ),

@@ -28,7 +28,7 @@ ROOMS = {
         "provenance", "exchange", "cli",
     ),
     "litho_models": (
-        "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
+        "layers", "simulator", "prediction", "models", "scan_terms", "effects", "splits",
         "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning", "cli",
     ),
     "litho_design": (
@@ -193,13 +193,6 @@ def _between(page: str, name: str) -> str:
 def test_virtual_fab_knows_no_model() -> None:
     for file in _sources("litho_data/virtual_fab"):
         assert not {n for n in _imports(file) if n.startswith("litho_models")}, file.name
-
-
-def test_the_convolutions_stand_behind_one_function() -> None:
-    room = ROOT / "litho_models" / "fast"
-    for file in (file for file in _sources("litho_models") if room not in file.parents):
-        inside = {name for name in _imports(file) if name.startswith("litho_models.fast")}
-        assert inside <= {"litho_models.fast.convolution_stack"}, file.relative_to(ROOT)
 
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))

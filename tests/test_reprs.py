@@ -21,7 +21,7 @@ def test_objects_are_shown_in_a_line(tmp_path):
     assert "'made', 3 scans" in repr(store)
     shown = store._repr_html_()
     assert "<td>P1F0</td>" in shown
-    assert repr(litho_models.load_frozen("zoo:pbl")).startswith("<FrozenSimulator pbl: 82,724 parameters")
+    assert repr(litho_models.load_frozen("zoo:pbl")).startswith("<FrozenSimulator pbl: 27,049 parameters")
 
 
 def test_a_notebook_shows_maps_and_the_card_of_a_model(tmp_path):
@@ -31,7 +31,7 @@ def test_a_notebook_shows_maps_and_the_card_of_a_model(tmp_path):
     assert "height, µm: 0 … 5" in shown
     assert shown.count("data:image/png") == 1
     assert make_scan(1)._repr_html_().count("data:image/png") == 2
-    assert "<td>82724</td>" in litho_models.load_frozen("zoo:pbl")._repr_html_()
+    assert "<td>27049</td>" in litho_models.load_frozen("zoo:pbl")._repr_html_()
     settings = litho_design.hologram_settings(
         changes={
             "layout.size_px": 64,

@@ -62,10 +62,9 @@ class SearchSettings(Record):
     keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
     polish_rounds: int = setting(10, "Rounds of single-level changes after the search", ge=0)
     checkpoint_every: int = setting(50, "Iterations between two checkpoints", ge=1)
-    precision: Literal["float32", "mixed", "bfloat16"] = setting(
+    precision: Literal["float32", "bfloat16"] = setting(
         "float32",
-        "Networks of the model in the search: float32; mixed, their gradient in bfloat16; or bfloat16; "
-        "scores are always in float32",
+        "Networks of the model in the search: float32 or bfloat16; scores are always in float32",
         option="--precision",
     )
     seed: int = setting(0, "Seed of start and sampling", option="--seed")

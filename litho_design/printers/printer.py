@@ -20,7 +20,7 @@ from litho_design.printers.layout import LayoutSettings
 
 _GUARD_UM = 6.4
 
-Precision = Literal["float32", "mixed", "bfloat16"]
+Precision = Literal["float32", "bfloat16"]
 
 
 class TilingCheck(Record):
@@ -174,8 +174,7 @@ class Printer(nn.Module):
     def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
         """Run the networks of a frozen model in ``precision`` inside the block.
 
-        ``mixed`` prints in float32 and sends gradients back through the areawise networks in bfloat16;
-        ``bfloat16`` does both so. Other models, and heights, blurs and waves, stay in float32.
+        Other models, and heights, blurs and waves, stay in float32.
         """
         at_precision = getattr(self.simulator, "at_precision", None)
         return nullcontext() if at_precision is None else at_precision(precision)

@@ -14,6 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
+# The models of the zoo that judge a design: one of each kind. Ridges go astray beyond smooth layouts.
+JUDGES = ("physics", "pbl", "fno")
 
 
 def load_printer(
@@ -81,7 +83,7 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Models of the zoo that were trained on the prints of the first of some models, and are none of them.
+    """Judges of the zoo that were trained on the prints of the first of some models, and are none of them.
 
     A model that was not calibrated for the layout is left out.
     """
@@ -89,7 +91,7 @@ def models_at_hand(
 
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
-    for name in zoo.list() if dataset else ():
+    for name in JUDGES if dataset else ():
         simulator = load_frozen(zoo.folder(name), device=device)
         printer = Printer(simulator, layout, source=f"{zoo.PREFIX}{name}").to(device)
         record = printer.record()

@@ -283,12 +283,18 @@ def export(
 
 @zoo.command("list")
 def list_zoo() -> None:
-    """List the models that come with the package.
+    """List the models that come with the package, and their errors on held-out scans.
 
     Example: litho-models zoo list
     """
-    for name in (f"{litho_models.zoo.PREFIX}{one}" for one in litho_models.zoo.list()):
-        typer.echo(f"{name:14} {litho_models.load_frozen(name)}")
+    from litho_models.frozen.card import ModelCard
+
+    zoo = litho_models.zoo
+    for name in zoo.list():
+        card = ModelCard.read(zoo.folder(name))
+        error = card.held_out.text if card.held_out else "no held-out error"
+        best = f"  = {zoo.PREFIX}{zoo.BEST}" * (zoo.folder(name) == zoo.folder(zoo.BEST))
+        typer.echo(f"{zoo.PREFIX + name:20} {error}, {card.parameters:,} parameters{best}")
 
 
 @zoo.command("show")

@@ -17,6 +17,8 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
+# What a figure is of: scans that the model was trained on, or fits of the same model to fewer scans.
+TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
 # Whose an effect of undetermined role is taken to be.
@@ -27,14 +29,24 @@ _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported number: what, how much, on which scans, with which nuisances and background."""
+    """One reported number: what, how much, on which scans, with which nuisances and background.
+
+    ``ci95`` is its interval over scans.
+    """
 
     name: str
     value: float
+    ci95: tuple[float, float] | None = None
     unit: str = "nm"
     split: str
     policy: str
     background: BackgroundUse = "none"
+
+    @property
+    def text(self) -> str:
+        """The figure and its interval."""
+        between = f" ({self.ci95[0]:.2f} … {self.ci95[1]:.2f})" if self.ci95 else ""
+        return f"{self.value:.2f} {self.unit}{between}"
 
 
 class ModelCard(RunFacts, Result):
@@ -85,6 +97,11 @@ class ModelCard(RunFacts, Result):
     fabrication_batch: str = ""
     optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
+
+    @property
+    def held_out(self) -> CardMetric | None:
+        """The error on scans that a fit has not seen; None for a model that was in no benchmark."""
+        return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 
     @field_validator("training", "split")
     @classmethod

@@ -1,15 +1,21 @@
-"""Frozen models that come with the package: their names and folders; ``load_frozen("zoo:pbl")`` opens one."""
+"""Frozen models that come with the package, those of the benchmark's table: their names and folders.
+
+``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
+"""
 
 from __future__ import annotations
 
 import builtins
+import json
 from collections.abc import Iterable
 from pathlib import Path
 
 from litho_data.foundation.errors import unknown_name
+from litho_models.frozen import hub
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
 PREFIX = "zoo:"
+BEST = "best"
 _CARD_FILE = "card.json"
 
 
@@ -19,31 +25,42 @@ def list(root: str | Path = ZOO_FOLDER) -> builtins.list[str]:
 
 
 def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
-    """The frozen model of that name, for commands that take a folder.
+    """The frozen model of that name, or the best one, for commands that take a folder.
 
     Raises:
         InputError: no such model.
     """
     known = list(root)
+    if name == BEST and known:
+        name = min(known, key=lambda one: _held_out_nm(Path(root) / one))
     if name not in known:
-        raise unknown_name("zoo model", name, known, "" if known else "examples/make_zoo.py trains it")
+        names = [*known, BEST] if known else []
+        raise unknown_name("zoo model", name, names, "" if known else "`make zoo` trains it")
     return Path(root) / name
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
-    """The folder of a model as a command is given it: a path, or ``zoo:NAME`` for a model of the zoo.
+    """The folder of a model as a command is given it: a path, ``zoo:NAME`` or ``hf://owner/name``.
 
     Args:
         source: what the user typed.
         other: names that the caller takes besides, for the message.
 
     Raises:
-        InputError: no such folder, or no such model in the zoo.
+        InputError: no such folder, no such model in the zoo, or one that cannot be fetched.
     """
     text = str(source)
+    if text.startswith(hub.ADDRESS):
+        return hub.fetched(text)
     if text.startswith(PREFIX):
         return folder(text.removeprefix(PREFIX))
     if not Path(source).is_dir():
         known = [*(f"{PREFIX}{name}" for name in list()), *other]
         raise unknown_name("model", text, known, also="the folder of a model")
     return Path(source)
+
+
+def _held_out_nm(folder: Path) -> float:
+    """The first figure of a card: the error on held-out scans."""
+    metrics = json.loads((folder / _CARD_FILE).read_text(encoding="utf-8"))["metrics"]
+    return metrics[0]["value"] if metrics else float("inf")

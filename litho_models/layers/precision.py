@@ -5,45 +5,28 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import cache
 from typing import Literal
 
 import torch
 
-Precision = Literal["float32", "mixed", "bfloat16"]
+Precision = Literal["float32", "bfloat16"]
 
 # Units that multiply in bfloat16, as PyTorch calls them: two of x86, two of ARM.
 _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
-_adjoint: ContextVar[torch.dtype | None] = ContextVar("adjoint", default=None)
-
 
 @contextmanager
 def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
-    """Networks that are called inside the block multiply in ``precision``; heights and blurs stay in float32.
-
-    ``mixed`` is float32, but gradients go back through areawise networks in bfloat16, which takes a CPU;
-    ``bfloat16`` is both ways so.
-    """
-    before = _adjoint.set(torch.bfloat16 if precision == "mixed" else None)
-    try:
-        with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
-            yield
-    finally:
-        _adjoint.reset(before)
-
-
-def adjoint_dtype() -> torch.dtype | None:
-    """Of products on the way back where it is not that of the way forwards, else None."""
-    return _adjoint.get()
+    """Networks called inside the block multiply in ``precision``; heights and blurs stay in float32."""
+    with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
+        yield
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
     """Say on stderr, once, that float32 would be faster: in ``precision`` on a CPU without a unit for it."""
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
-        what = "gradients of networks" if precision == "mixed" else "networks"
-        _say(f"{what} in bfloat16: float32 is faster on this processor, which has no bfloat16 unit")
+        _say("networks in bfloat16: float32 is faster on this processor, which has no bfloat16 unit")
 
 
 def has_bfloat16_unit() -> bool:

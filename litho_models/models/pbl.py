@@ -16,10 +16,8 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.fast import convolution_stack
 from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
-from litho_models.layers.precision import adjoint_dtype
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
     FeatureNetwork,
@@ -247,8 +245,6 @@ class AreawiseNet(nn.Module):
     """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
 
     ``transposable``: of each kernel is used the mean with its transpose, so that x and y are alike.
-    ``activation`` may be any function of one value; the compiled stack knows the leaky ReLU only, and every
-    other one runs layer by layer.
     """
 
     def __init__(self, channels: tuple[int, ...], leaky_slope: float, transposable: bool = False):
@@ -258,7 +254,7 @@ class AreawiseNet(nn.Module):
         convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
-        self.activation: nn.Module = nn.LeakyReLU(leaky_slope)
+        self.activation: nn.Module = nn.LeakyReLU(leaky_slope, inplace=True)
         for convolution in convolutions:
             weight = convolution.weight
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -269,11 +265,6 @@ class AreawiseNet(nn.Module):
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
         """Interior of (b, 1, y, x) without padding; the same size with a zero padding of 1 per layer."""
-        # Small tiles are for the cache of a CPU; a GPU wants large ones.
-        if padding == 0 and height_um.device.type == "cpu":
-            activation = self.activation
-            if isinstance(activation, nn.LeakyReLU) and activation.negative_slope > 0:
-                return self._in_tiles(height_um, activation.negative_slope)
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
@@ -282,20 +273,6 @@ class AreawiseNet(nn.Module):
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding
-            )
-
-    def _in_tiles(self, height_um: Tensor, leaky_slope: float) -> Tensor:
-        layers = cast(list[nn.Conv2d], [*self.hidden, self.last])
-        dtype = self.last.weight.dtype
-        hidden = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else dtype
-        with torch.autocast(device_type="cpu", enabled=False):
-            return convolution_stack(
-                height_um.to(dtype),
-                [self._kernel(layer) for layer in layers],
-                [cast(Tensor, layer.bias) for layer in layers],
-                leaky_slope=leaky_slope,
-                hidden_dtype=hidden,
-                adjoint_dtype=adjoint_dtype() or hidden,
             )
 
     def _kernel(self, layer: nn.Conv2d) -> Tensor:

@@ -16,7 +16,7 @@ from litho_data.foundation.run_facts import run_facts
 from litho_design import design_hologram, hologram_settings, score
 from litho_design.cli.app import app, main
 from litho_design.printers.layout import LayoutSettings
-from litho_design.printers.source import load_printer
+from litho_design.printers.source import JUDGES, load_printer
 from litho_design.printers.training import OutOfDistribution
 from litho_design.reports.advice import distribution_warning, spread_sentence, stroke_advice
 from litho_design.tasks.design import Design
@@ -159,7 +159,7 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path):
     known = {"judges": (), "announce": False}
     design = design_hologram("ring", "zoo:physics", tmp_path / "design", settings=settings, **known)
     result = score(tmp_path / "design", tmp_path / "score")
-    others = [one for one in zoo.list() if one != "physics"]
+    others = [one for one in JUDGES if one != "physics"]
     assert [one.judge.source for one in result.scores] == [f"{zoo.PREFIX}{one}" for one in others]
     assert all(one.independent for one in result.scores)
     values = [design.predicted["si_psnr_db"], *(one.figures["si_psnr_db"] for one in result.scores)]

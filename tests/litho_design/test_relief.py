@@ -179,7 +179,8 @@ def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys)
         main()
     assert stop.value.code == 0
     said = capsys.readouterr()
-    assert "take --height-um 1.2 or less" in said.err
+    assert "the levels print 0.841 µm" in said.err
+    assert "take --height-um 0.84" in said.err
     assert "free levels" in said.out
     assert "nm rms from the relief" in said.out
     rest = np.load(tmp_path / "out" / "unprintable_um.npy")

@@ -80,7 +80,7 @@ def test_what_cannot_leave_says_why_and_leaves_no_file(tmp_path: Path) -> None:
 
 
 def test_the_command_says_size_and_difference(tmp_path: Path) -> None:
-    frozen("affine", tmp_path)
+    save_frozen(build_model("affine"), tmp_path / "affine")
     out = tmp_path / "affine.pt2"
     words = ["export", str(tmp_path / "affine"), "--size-px", "64", "--out", str(out)]
     done = CliRunner().invoke(app, words)

@@ -9,7 +9,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from litho_data import InputError, read_scan
-from litho_models import load_frozen, save_frozen
+from litho_models import load_frozen, save_frozen, zoo
 from litho_models.cli.app import app
 from litho_models.models import build_model
 
@@ -91,8 +91,10 @@ def test_a_file_of_levels_becomes_a_height_map_that_can_be_read_again(folder, mo
 
 def test_the_zoo_is_listed_and_shown():
     listed = CliRunner().invoke(app, ["zoo", "list"], catch_exceptions=False).output
-    assert [line.split()[0] for line in listed.splitlines()] == ["zoo:fno", "zoo:pbl", "zoo:physics"]
-    assert "82,724 parameters" in listed
+    assert [line.split()[0] for line in listed.splitlines()] == [f"zoo:{name}" for name in zoo.list()]
+    assert "18.83 nm (17.99 … 19.64), 27,049 parameters" in listed
+    (best,) = (line for line in listed.splitlines() if "= zoo:best" in line)
+    assert best.startswith("zoo:random-features ")
     page = CliRunner().invoke(app, ["zoo", "show", "pbl"], catch_exceptions=False).output
     assert page.startswith("# pbl")
     with pytest.raises(InputError, match="zoo model, got 'nothing'"):

@@ -1,0 +1,162 @@
+"""Make the models that ship with the package: those of the benchmark's table, by its settings.
+
+    make zoo
+    python -m benchmarks.zoo runs/zoo --models pbl,fno
+
+Training sees all scans but the locked ones. A finished run is taken as it is, a killed one continues.
+The cards lead with the errors of the table, which are those of five fits to fewer scans each.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measured import FOLDER, ROOT, in_table
+from litho_data import build_dataset
+from litho_data.commands.progress import run_script
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan, open_store
+from litho_models.evaluation.results import Benchmark
+from litho_models.fitting.runs import TrainingRun, train
+from litho_models.frozen import zoo
+from litho_models.frozen.card import OUT_OF_FOLD, TRAINED_ON, Attribution, CardMetric, ModelCard
+from litho_models.frozen.files import README_FILE, load_frozen
+from litho_models.frozen.freezing import SCAN_AXIS, freeze
+from litho_models.frozen.on_store import card_background, predict_frozen
+from litho_models.frozen.readme import model_readme
+from litho_models.scan_terms import BackgroundUse, NuisanceProtocol
+from litho_models.scoring.records import ModelScores, Prediction
+from litho_models.scoring.scores import score_model
+
+CARD = ROOT / "datasets" / "neural-lithography.toml"
+LARGEST_ZOO_BYTES = 10_000_000
+# The model that was scored has it; whose it is the prints cannot tell.
+WHOLE: dict[str, dict[str, Attribution]] = {"pbl": {SCAN_AXIS: "printer"}}
+LIMITATIONS = [
+    "Trained on prints of one machine, resist and protocol: retrain for any other.",
+    "The locked scans took no part.",
+    "Out-of-fold errors are of other fits by the same settings, each to fewer scans.",
+]
+
+
+def make_zoo(
+    store: str | Path,
+    runs: str | Path,
+    table: Benchmark,
+    root: str | Path = zoo.ZOO_FOLDER,
+    models: Sequence[str] = (),
+) -> dict[str, ModelCard]:
+    """Train, freeze and describe the models of a table; an interrupted call continues.
+
+    Args:
+        store: dataset store.
+        runs: folder of the run folders.
+        table: benchmark of that store with split ``grouped``.
+        root: the zoo to write into, a folder per model.
+        models: some of the table's; all by default.
+
+    Raises:
+        InputError: a table of other data, models trained by other settings, or a zoo that is too large.
+    """
+    dataset = open_store(store)
+    if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
+        raise InputError(
+            "table of the zoo",
+            got=f"split {table.split.kind} of {table.dataset.name}",
+            wanted=f"split grouped of {dataset.name}, the store given",
+        )
+    scans = [scan for scan in dataset.scans() if scan.id not in dataset.locked_ids]
+    scores = {row.model: row for row in table.scores}
+    cards = {}
+    for name in models or scores:
+        run, folder = Path(runs) / name, Path(root) / name
+        trained = TrainingRun.read(run) if (run / TrainingRun.FILE_NAME).exists() else train(store, name, run)
+        _require_settings(name, trained.config.model_dump(mode="json"), table.training[name])
+        card = freeze(run, folder, WHOLE.get(name))
+        protocol, own = _scored(folder, scans)
+        described: dict[str, Any] = {
+            "metrics": [*card_metrics(scores[name], OUT_OF_FOLD), *card_metrics(own, TRAINED_ON)],
+            "command": f"litho-models train {dataset.name}.zarr --model={name} --out={name}",
+            "nuisance": protocol.model_dump(mode="json"),
+            "limitations": LIMITATIONS,
+        }
+        cards[name] = card.model_copy(update=described)
+        cards[name].write(folder)
+        (folder / README_FILE).write_text(model_readme(cards[name]), encoding="utf-8")
+    size = size_bytes(root)
+    if size > LARGEST_ZOO_BYTES:
+        raise InputError("size of the zoo", got=f"{size} bytes", wanted=f"at most {LARGEST_ZOO_BYTES}")
+    return cards
+
+
+def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
+    """The figures of a row of the table, in its order."""
+    bare = {row.policy: row for row in scores.without_background}
+    used: BackgroundUse = "training" if bare else "none"
+    free = {row.policy: row for row in scores.by_policy}
+    columns = [
+        (free["offset"], used),
+        *[(bare["offset"], "none")] * bool(bare),
+        (free["full"], used),
+        (free["none"], used),
+    ]
+    return [
+        CardMetric(
+            name="mae_abs" if row.policy == "none" else "mae_datum_free",
+            value=row.mae_nm,
+            ci95=row.ci95_nm,
+            split=split,
+            policy=row.policy,
+            background=background,
+        )
+        for row, background in columns
+    ]
+
+
+def size_bytes(root: str | Path) -> int:
+    """What the zoo adds to the package."""
+    return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())
+
+
+def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtocol, ModelScores]:
+    """The errors of a frozen model on scans, with the background of its card."""
+    model = load_frozen(folder)
+    learned = card_background(model, scans)
+    predictions = [Prediction.beside(learned, predict_frozen(model, scan)) for scan in scans]
+    protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
+    return protocol, score_model(model.name, scans, predictions, protocol)
+
+
+def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Refuse a model that was trained in another way than the table's."""
+    for key, value in wanted.items():
+        # A fit by least squares takes no optimiser of the recipe.
+        if key != "optimiser" and trained[key] != value:
+            raise InputError(f"{key} of {name}", got=trained[key], wanted=f"{value}, as in the table")
+
+
+def main() -> None:
+    """Build the store, make the models, print their errors."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path, help="folder of the store and of the training runs")
+    parser.add_argument("--models", help="names, separated by commas; all of the table by default")
+    given = parser.parse_args()
+    store = given.runs / "neural-lithography.zarr"
+    if not store.exists():
+        build_dataset(CARD, store)
+    table = Benchmark.model_validate(in_table(FOLDER))
+    cards = make_zoo(store, given.runs, table, models=given.models.split(",") if given.models else ())
+    for name, card in cards.items():
+        print(f"{name:16} {card.parameters:9,} numbers")
+        for metric in card.metrics:
+            print(f"  {metric.name:16} {metric.text:28} policy {metric.policy:8} {metric.split}")
+    print(f"{zoo.ZOO_FOLDER.name}: {size_bytes(zoo.ZOO_FOLDER) / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    run_script(main)
