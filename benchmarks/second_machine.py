@@ -3,10 +3,9 @@
     litho-data build datasets/prefab-soi.toml --out prefab-soi.zarr
     python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--publish]
 
-Models are fitted by fold, whole patterns held out, and judged by their edges. Then the loop: to a printer of
-a spot and a threshold, the part that improves the held-out edges most is added, as long as that is more than
-chance.
-An interrupted run resumes.
+Models are fitted per fold, with whole patterns held out, and judged by their edges. Then a search adds parts
+to a printer of a spot and a threshold: each time the one that improves the held-out edges most, while the
+gain is more than chance. An interrupted run resumes.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import DAMAGED, Channel, Loaded, Reader, extent_um, one_by_one
 
 _MAGIC = b"GWYP"
-# A component has the small letter of its type, an array of them the capital one.
+# Types of single values; the capital letter stands for an array of the same type.
 _NUMBERS = {"b": "?", "c": "u1", "i": "<i4", "q": "<i8", "d": "<f8"}
 _FIELD_KEY = re.compile(r"/(\d+)/data")
 

@@ -14,7 +14,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# The models of the zoo that judge a design: one of each kind. Ridges go astray beyond smooth layouts.
+# The zoo models that judge a design, one of each kind. Ridges extrapolate badly from smooth layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 

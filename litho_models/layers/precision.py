@@ -18,7 +18,7 @@ _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
 @contextmanager
 def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
-    """Networks called inside the block multiply in ``precision``; heights and blurs stay in float32."""
+    """Inside the block, networks multiply in ``precision``; heights and blurs stay in float32."""
     with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
         yield
 

@@ -28,7 +28,7 @@ MODELS: dict[str, type[Simulator]] = {
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
     """Take a model by its name from now on, in every function and command of this process.
 
-    For work in several processes, put the call in a module that each of them imports.
+    To work in several processes, call this in a module that every process imports.
 
     Raises:
         InputError: no name of its own, or one that is taken.

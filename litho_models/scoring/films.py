@@ -1,4 +1,4 @@
-"""Films against films: how much area differs, and which features are lost, too many, or joined.
+"""Compare films: the difference in area, and the features that are missing, extra or merged.
 
 A feature is a connected part of the film or of the ground within it, of at least four pixels, cut at half the
 film's height.
@@ -31,7 +31,7 @@ class FilmErrors(NamedTuple):
 
 
 def films_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> FilmErrors:
-    """Film of a scan freed of its nuisances against that of its prediction."""
+    """Compare the film of a scan with the predicted one, the per-scan terms removed."""
     return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
 
 

@@ -143,7 +143,7 @@ class ModelScores(MetricValues):
 
     @property
     def leading_nm(self) -> float:
-        """The error that ranks models: of edges for films, of heights else; infinite without an edge."""
+        """The error that ranks models: edges for films, heights otherwise; infinite without an edge."""
         value = getattr(self, LEADING[self.seen_by])
         return math.inf if value is None else float(value)
 

@@ -57,12 +57,12 @@ class _Contour(NamedTuple):
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> float | None:
-    """SSIM of a scan freed of its nuisances (prediction plus residual) and its prediction."""
+    """SSIM of a scan and its prediction, the per-scan terms removed (prediction plus residual)."""
     return structural_similarity(prediction_um + residual_um, prediction_um)
 
 
 def edges_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> EdgePlacement:
-    """Edges of a scan freed of its nuisances against those of its prediction."""
+    """Compare the edges of a scan with the predicted ones, the per-scan terms removed."""
     heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
     if scan.seen_by == "sem":
         heights, search_um = np.array([film_edge_um(scan)]), FILM_SEARCH_PX * scan.pitch_um
