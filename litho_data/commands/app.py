@@ -77,6 +77,23 @@ def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> 
     return run
 
 
+def keyword(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
+    """A parameter of a command that typer makes an option of."""
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def takes_more(
+    run: Callable[..., None],
+    command: Callable[..., None],
+    more: Sequence[inspect.Parameter],
+    without: str = "",
+) -> Callable[..., None]:
+    """Give ``run``, which wraps a command, the parameters of the command but ``without``, and more."""
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    kept = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own if one.name != without]
+    return takes(run, [*kept, *more])
+
+
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that hides some of its options ``--help-all``, which shows them."""
 
@@ -85,10 +102,7 @@ def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
         values.pop("help_all")
         command(**values)
 
-    kind = inspect.Parameter.KEYWORD_ONLY
-    own = inspect.signature(command, eval_str=True).parameters.values()
-    shown = [*own, inspect.Parameter("help_all", kind, default=False, annotation=HelpAll)]
-    return takes(run, [one.replace(kind=kind) for one in shown])
+    return takes_more(run, command, [keyword("help_all", HelpAll, False)])
 
 
 def new_app(help_text: str) -> typer.Typer:

@@ -151,7 +151,7 @@ class Page:
         for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
                 frame.to_csv(temporary, index=False)
-            write_table(frame.set_axis(names, axis=1), target / csv_name, digits)
+            write_table(frame, names, target / csv_name, digits)
         write_figures(self._figures, target)
         run = self._run or RunFacts(**run_facts())
         commit = run.commit + (" with changes" if run.dirty else "")

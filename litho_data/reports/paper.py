@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from litho_data.commands.app import option, takes
+from litho_data.commands.app import keyword, option, takes_more
 from litho_data.foundation.files import atomic_file
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
 # What is wider than this on the screen is not legible in one column.
 _WIDE_INCH = 8.0
 _FONT_PT, _DPI = 7.0, 300
-_ENDINGS = {"latex": ".tex", "markdown": ".md"}
 
 
 @dataclass(frozen=True)
@@ -63,20 +61,15 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
         with paper_copies(values.pop("figures"), values.pop("tables")):
             command(**values)
 
-    kind = inspect.Parameter.KEYWORD_ONLY
     figures = Annotated[Figures | None, option("also write the figures, in the widths of a paper's columns")]
     tables = Annotated[Tables, option("what the tables are written as, beside CSV")]
-    own = inspect.signature(command, eval_str=True).parameters.values()
-    shown = [
-        *(one.replace(kind=kind) for one in own),
-        inspect.Parameter("figures", kind, default=None, annotation=figures),
-        inspect.Parameter("tables", kind, default="csv", annotation=tables),
-    ]
-    return takes(run, shown)
+    return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
     """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; they are changed."""
+    if not figures:
+        return
     import matplotlib
     from matplotlib.text import Text
 
@@ -92,12 +85,18 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
                 figure.savefig(temporary, format=ending, dpi=_DPI)
 
 
-def write_table(frame: pd.DataFrame, csv_path: Path, digits: int) -> None:
-    """Write a table as asked for, beside its CSV file: full precision there, ``digits`` places here."""
+def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
+    """Write a table as asked for, beside its CSV file: full precision there, ``digits`` places here.
+
+    Args:
+        frame: the table; ``names``: what a reader calls its columns.
+        csv_path: its CSV file.
+    """
     if wanted().tables == "csv":
         return
-    with atomic_file(csv_path.with_suffix(_ENDINGS[wanted().tables])) as temporary:
-        temporary.write_text(_TEXTS[wanted().tables](frame, digits), encoding="utf-8")
+    ending, text_of = _TEXTS[wanted().tables]
+    with atomic_file(csv_path.with_suffix(ending)) as temporary:
+        temporary.write_text(text_of(frame.set_axis(list(names), axis=1), digits), encoding="utf-8")
 
 
 def _latex(frame: pd.DataFrame, digits: int) -> str:
@@ -115,4 +114,7 @@ def _markdown(frame: pd.DataFrame, digits: int) -> str:
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
-_TEXTS: dict[str, Callable[[pd.DataFrame, int], str]] = {"latex": _latex, "markdown": _markdown}
+_TEXTS: dict[str, tuple[str, Callable[[pd.DataFrame, int], str]]] = {
+    "latex": (".tex", _latex),
+    "markdown": (".md", _markdown),
+}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 import typer
 from pydantic import BaseModel
 
-from litho_data.commands.app import takes, with_further_options
+from litho_data.commands.app import keyword, takes_more, with_further_options
 from litho_data.commands.settings import Leaf, assigned, flattened, leaves, read_settings
 from litho_data.foundation.errors import InputError
 
@@ -152,7 +152,7 @@ def takes_settings(
             found.setdefault(leaf.path, []).append(leaf)
     paths = {path.replace(".", "_"): path for path in found}
     extra = [_parameter(name, found[path], len(presets)) for name, path in paths.items()]
-    extra += [_keyword("config", _Config), _keyword("set_", _Set)]
+    extra += [keyword("config", _Config), keyword("set_", _Set)]
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
@@ -169,9 +169,7 @@ def takes_settings(
             names = {path: found[path][0].options[0] for path in options} | dict.fromkeys(words, "--set")
             command(**values, given=Given({**options, **words}, names, config))
 
-        own = inspect.signature(command, eval_str=True).parameters.values()
-        shown = [*(parameter for parameter in own if parameter.name != "given"), *extra]
-        return with_further_options(takes(run, shown))
+        return with_further_options(takes_more(run, command, extra, without="given"))
 
     return decorate
 
@@ -209,11 +207,7 @@ def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Paramet
         rich_help_panel=leaf.group or None,
         hidden=leaf.path not in _FIRST,
     )
-    return _keyword(name, Annotated[leaf.kind | None, option])
-
-
-def _keyword(name: str, annotation: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    return keyword(name, Annotated[leaf.kind | None, option])
 
 
 def _described(leaf: Leaf) -> str:

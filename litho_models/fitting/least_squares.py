@@ -116,20 +116,17 @@ def fit_least_squares(
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
         small = gained < rules.relative_gain * loss
+        # Only derivatives taken here can tell that no larger step is left.
+        ends = small and fresh
         if rules.kept_above is None:
-            holds = False
+            kept = False
         else:
-            holds = small or gained >= rules.kept_above * equations.promised(step)
-        if holds and (fresh or not small):
-            linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
-            if small:
-                break
-            fresh = False
-        else:
-            linear = problem.linearise(vector)
-            if small and fresh:
-                break
-            fresh = True
+            promised = promised_gain(equations.matrix, equations.right, step)
+            kept = ends or (not small and gained >= rules.kept_above * promised)
+        linear = with_residuals(linear, left) if kept else problem.linearise(vector)
+        if ends:
+            break
+        fresh = not kept
     if not fresh:
         linear = problem.linearise(vector)
     return LeastSquaresFit(vector, linear, losses)
@@ -191,10 +188,6 @@ class NormalEquations:
         terms = np.linalg.lstsq(self.matrix[count:, count:], rest, rcond=1e-14)[0]
         return step, terms[: scans * each].reshape(scans, each)
 
-    def promised(self, step: np.ndarray) -> float:
-        """What a step (p,) gains if the problem is linear, with ``squares``."""
-        return float(2 * self.right @ step - step @ self.matrix @ step)
-
     def _parameters_only(self) -> tuple[np.ndarray, np.ndarray]:
         """The equations with the terms of the scans eliminated."""
         count = self.count
@@ -204,6 +197,16 @@ class NormalEquations:
         solved = np.linalg.lstsq(self.matrix[count:, count:], columns, rcond=1e-14)[0]
         across = self.matrix[:count, count:] @ solved
         return self.matrix[:count, :count] - across[:, :-1], self.right[:count] - across[:, -1]
+
+
+def promised_gain(matrix: np.ndarray, right: np.ndarray, step: np.ndarray) -> float:
+    """What a step (p,) takes from the squares of normal equations (p, p), (p,) if the problem is linear."""
+    return float(2 * right @ step - step @ matrix @ step)
+
+
+def with_residuals(linear: Sequence[Linearised], left: Sequence[np.ndarray]) -> list[Linearised]:
+    """All scans with these residuals (n,), µm, and the derivatives that they have."""
+    return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -21,7 +21,9 @@ from litho_models.fitting.least_squares import (
     eliminated_sum,
     fit_least_squares,
     orthonormal,
+    promised_gain,
     solve_damped,
+    with_residuals,
 )
 from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.model import Placed, Twin, exposed, finished
@@ -247,18 +249,17 @@ def _without(
     if isinstance(common.base, FoldedBase):
         # At the common fit each window was predicted by a model that has seen the fold.
         left = TwinProblem(common, windows, fold).residuals(vector)
-        linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
+        linear = with_residuals(linear, left)
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(_FOLD_STEPS):
         step = solve_damped(normal, right, _FOLD_DAMPING, common.at(vector).room())
         trial = vector + step
         # So small a step is what the derivatives say.
-        if 2 * right @ step - step @ normal @ step <= _FOLD_GAIN * total:
+        if promised_gain(normal, right, step) <= _FOLD_GAIN * total:
             vector = trial
             break
         left = TwinProblem(common, windows, fold).residuals(trial)
-        moved = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
-        _, right, squares = eliminated_sum(moved, RULES.term_weight)
+        _, right, squares = eliminated_sum(with_residuals(linear, left), RULES.term_weight)
         if squares > total:
             break
         vector, total = trial, squares
