@@ -9,6 +9,7 @@ import typer
 
 import litho_models
 from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
 
@@ -30,6 +31,10 @@ def close_loop(
             "--base", help="model to correct: its name, a frozen one (a folder, zoo:NAME), or auto: the best"
         ),
     ] = "auto",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="FIELD=VALUE of a small base, such as spots=1; repeatable"),
+    ] = None,
     folds: Annotated[int, typer.Option("--folds", min=2, help="by scan")] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
@@ -66,6 +71,7 @@ def close_loop(
         out,
         new_prints=stores[1:],
         base=base,
+        base_settings=assigned(set_ or ()),
         folds=folds,
         nested=nested,
         inject=tuple(inject or ()),

@@ -22,6 +22,7 @@ from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.records import Prediction
+from litho_models.scoring.shapes import edges_of_scan
 from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
@@ -40,14 +41,19 @@ def error_rows(
     numbers: tuple[int, int],
     seed: int = 0,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy."""
+    """Errors of maps (y, x) µm under each reported policy; films have no zero of their own to be freed of."""
     rows = []
-    for policy in REPORTED:
+    for policy in ("none",) if scans[0].seen_by == "sem" else REPORTED:
         fits = [
             cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
             for scan, own in zip(scans, maps_um, strict=True)
         ]
         mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
+        edges = {
+            scan.id: edges_of_scan(scan, own, fit.residual_um).mean_nm or 0.0
+            for scan, own, fit in zip(scans, maps_um, fits, strict=True)
+            if scan.seen_by == "sem"
+        }
         mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
         rows.append(
             ErrorRow(
@@ -62,6 +68,7 @@ def error_rows(
                 mae_ci95_nm=interval(mae),
                 rmse_nm=float(np.sqrt(np.mean(mse))),
                 by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
+                edge_by_scan_nm=edges,
             )
         )
     return rows
@@ -106,8 +113,9 @@ class HeldOut:
         numbers = len(plain.twin.vector)
         maps = held_out_maps(plain, study, self.closed.original)
         rows = self._rows("base", "print alone", "scans", maps, (numbers, 0))
-        published = self._published(plain, maps)
-        rows += self._rows("base", "published", "scans", published, (numbers, _PUBLISHED_NUMBERS))
+        if not study.of_films:
+            published = self._published(plain, maps)
+            rows += self._rows("base", "published", "scans", published, (numbers, _PUBLISHED_NUMBERS))
         for name, state in self.stages.items():
             self.settings.report("scoring the base" if name == "base" else f"scoring {name}")
             rows += self._rows(name, "shared", "scans", *self._by_fold(state))
@@ -134,10 +142,10 @@ class HeldOut:
     def left_out_nm(self) -> dict[str, float]:
         """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
         model, found = self.closed.final, {}
-        whole_nm = self._mae_nm(model) if model.twin.names else 0.0
+        whole_nm = self._error_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.settings.report(f"leaving out {name}")
-            found[name] = self._mae_nm(model.without(name, self.closed.study)) - whole_nm
+            found[name] = self._error_nm(model.without(name, self.closed.study)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -166,11 +174,11 @@ class HeldOut:
     def _ends(self) -> tuple[tuple[Stage, State], ...]:
         return ("base", self.closed.base), ("all", self.closed.final)
 
-    def _mae_nm(self, state: State) -> float:
-        """Mean absolute error, k = 1: the printer as it stands, the measurement learned again beside it."""
+    def _error_nm(self, state: State) -> float:
+        """The leading error: the printer as it stands, the measurement learned again beside it."""
         row = error_of(self._rows("all", "shared", "scans", *self._by_fold(state, refit=False)), "all")
         assert row is not None
-        return row.mae_nm
+        return row.leading_nm
 
     def _rows(
         self, model: Stage, measurement: MeasuredBy, held_out: Any, maps: Maps, numbers: tuple[int, int]

@@ -12,7 +12,7 @@ from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
-from litho_models.scan_terms.policies import Policy
+from litho_models.scan_terms.policies import Policy, usual_policy
 from litho_models.scoring.statistics import OverUnits
 from litho_models.splits.folds import Split
 
@@ -44,6 +44,7 @@ class ErrorRow(Record):
         held_out: folds of scans, or whole prints; nested where everything was chosen anew without them.
         printer_numbers: fitted numbers of the model; ``measurement_numbers``: of the measurement, the largest
             of any fold.
+        edge_by_scan_nm: mean distance of the edges, of films.
     """
 
     model: Stage
@@ -57,6 +58,17 @@ class ErrorRow(Record):
     mae_ci95_nm: tuple[float, float] | None
     rmse_nm: float
     by_scan_nm: dict[str, float]
+    edge_by_scan_nm: dict[str, float] = Field(default_factory=dict)
+
+    @property
+    def leading_by_scan_nm(self) -> dict[str, float]:
+        """The error that counts: of the edges of films, of all heights otherwise."""
+        return self.edge_by_scan_nm or self.by_scan_nm
+
+    @property
+    def leading_nm(self) -> float:
+        """Its mean over the scans."""
+        return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
 
 
 class Strength(Record):
@@ -223,7 +235,7 @@ class CloseLoop(Result):
     def error(
         self,
         model: Stage,
-        policy: Policy = "offset",
+        policy: Policy | None = None,
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
@@ -234,11 +246,12 @@ class CloseLoop(Result):
 def error_of(
     errors: Sequence[ErrorRow],
     model: Stage,
-    policy: Policy = "offset",
+    policy: Policy | None = None,
     measurement: MeasuredBy = "shared",
     held_out: str = "scans",
 ) -> ErrorRow | None:
-    """The row of some errors with these terms; None if there is none."""
+    """The row of some errors with these terms, the usual ones unless stated; None if there is none."""
+    policy = policy or usual_policy(bool(errors[0].edge_by_scan_nm))
     wanted = model, policy, measurement, held_out
     rows = (row for row in errors if (row.model, row.policy, row.measurement, row.held_out) == wanted)
     return next(rows, None)

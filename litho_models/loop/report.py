@@ -41,9 +41,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     )
     page.verdict(verdict_text(result))
     page.tiles(
-        [(f"{row.mae_nm:.2f} nm", f"{_STAGES[row.model]}, k = {row.k:g}") for row in _headline(result)]
+        [(f"{row.leading_nm:.2f} nm", f"{_STAGES[row.model]}, k = {row.k:g}") for row in _headline(result)]
     )
-    page.figure(_bars(result), "Error on held-out scans, zero of each scan free. Grey: the base.")
+    page.figure(_bars(result), "Error on held-out scans. Grey: the base.")
     if result.effects:
         page.heading("What was found")
         page.points([effect_text(one) for one in result.effects])
@@ -93,7 +93,11 @@ def verdict_text(result: CloseLoop) -> str:
     names = [one.name + _by(one) for one in result.effects if one.knowledge == "cause"]
     laws = [one.title for one in result.effects if one.knowledge == "law"]
     before, after = _headline(result)[0], _headline(result)[-1]
-    gain = f"On held-out scans the error goes from {before.mae_nm:.2f} to {after.mae_nm:.2f} nm (k = 1)."
+    what = "edge error" if before.edge_by_scan_nm else "error"
+    gain = (
+        f"On held-out scans the {what} goes from {before.leading_nm:.2f} to {after.leading_nm:.2f} nm "
+        f"(k = {before.k:g})."
+    )
     found = "; ".join(
         part
         for part in (
@@ -166,11 +170,11 @@ def _bars(result: CloseLoop) -> Figure:
     axes = figure.subplots()
     at = np.arange(len(rows))[::-1]
     colours = [_BEFORE if row.model == "base" else _AFTER for row in rows]
-    drawn = axes.barh(at, [row.mae_nm for row in rows], color=colours, height=0.66)
+    drawn = axes.barh(at, [row.leading_nm for row in rows], color=colours, height=0.66)
     axes.bar_label(drawn, fmt="%.2f", padding=4)
     axes.set_yticks(at, labels)
     axes.margins(x=0.15)
-    axes.set_xlabel("mean absolute error on held-out scans (nm)")
+    axes.set_xlabel("error on held-out scans (nm)")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 

@@ -58,7 +58,8 @@ def record(
     before, after = error_of(errors, "base"), error_of(errors, "all")
     assert before is not None
     assert after is not None
-    gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
+    was_nm, is_nm = before.leading_by_scan_nm, after.leading_by_scan_nm
+    gains = [was_nm[scan.id] - is_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
         **given,
@@ -226,7 +227,8 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
     """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
     sets = {other: one.name for one in added for other in one.confusable_with}
     done = {*seen, *(one.name for one in added)}
-    untestable = {**UNTESTABLE, **closed.untestable}
+    films = closed.study.of_films
+    untestable = {} if films else {**UNTESTABLE, **closed.untestable}
     found = [
         Candidate(name=name, verdict="not-testable", reason=reason)
         for name, reason in untestable.items()
@@ -235,7 +237,7 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
     found += [
         _candidate(closed, name, sets)
         for name, effect in CATALOGUE.items()
-        if name not in {*done, *untestable} and not effect.per_scan
+        if name not in {*done, *untestable} and not effect.per_scan and effect.of_films == films
     ]
     return found
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from pydantic import ValidationError
+
+from litho_data.commands.settings import refused
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.electron_beam import ElectronBeam
@@ -67,6 +70,15 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
-    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters)."""
+    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters).
+
+    Raises:
+        InputError: an unknown model or field, or a value that the field does not take.
+    """
     model = model_class(name)
-    return model(model.Config.of_variant(variant, **fields))
+    for field in fields:
+        require_known(f"setting of {name}", field, model.Config.model_fields)
+    try:
+        return model(model.Config.of_variant(variant, **fields))
+    except ValidationError as error:
+        raise refused(error) from None

@@ -14,7 +14,7 @@ from litho_models.layers.gaussian import blur_interior, kernel_radius_px
 from litho_models.simulator import crop_border
 
 # Change of the resist from pixel to pixel below which there is no edge.
-_FLATTEST = 5e-3
+FLATTEST = 5e-3
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
@@ -66,5 +66,5 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
-    slope = torch.sqrt(slope_y**2 + slope_x**2 + _FLATTEST**2)
+    slope = torch.sqrt(slope_y**2 + slope_x**2 + FLATTEST**2)
     return torch.sigmoid(4 * ((crop_border(resist, 1) - threshold) / slope + bias_um / pitch_um))

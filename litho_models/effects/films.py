@@ -1,0 +1,75 @@
+"""Films: what moves the edges of a film that is written, developed or etched, and seen from above."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_models.effects.effect import FieldContext, Parameter, Values, entry
+from litho_models.effects.filters import add_blur, add_warp, gradient
+from litho_models.models.parts import FLATTEST, etch
+
+# Blur of a film that gives its edges a normal, µm.
+_NORMAL_UM = 0.012
+_DIFFUSION_REACH_UM = 0.2
+
+_of_films = partial(entry, role="process", of_films=True)
+
+
+@_of_films(
+    "electrons that come back from the substrate",
+    {
+        "weight": Parameter("1", 0.0, 1.5, 0.1),
+        "length_um": Parameter("µm", 0.03, 1.0, 0.08, "shape", tried=(0.05, 0.1, 0.2, 0.4)),
+    },
+    stage="exposure",
+    acts_on="layout",
+    source="second Gaussian of the proximity function: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)",
+    separating="write one feature alone and inside dense surroundings of three sizes",
+)
+def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = (M + η G_b * M) / (1 + η): the dose of what is written within b comes back."""
+    weight, length = values["weight"], values["length_um"]
+    blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
+    return layout + weight / (1 + weight) * (blurred - layout)
+
+
+@_of_films(
+    "what the dose made spreading before there is an edge",
+    {"variance_um2": Parameter("µm²", 0.0, 0.0025, 1e-4, tried=(1e-4, 6e-4))},
+    stage="resist",
+    acts_on="height",
+    source="acid or reactants that diffuse in a resist of high contrast, then a threshold at one half",
+    separating="write necks and islands of five widths, bake for two times",
+)
+def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The film blurred by a Gaussian of variance s², and its edge put where the blurred film is one half."""
+    full, pitch = context.full_height_um, context.pitch_um
+
+    def edged(field: Tensor) -> Tensor:
+        return full * etch(functional.pad(field / full, (1,) * 4, mode="replicate"), 0.5, 0.0, pitch)
+
+    blurred = add_blur(height, values["variance_um2"], pitch, _DIFFUSION_REACH_UM)
+    return height + edged(blurred) - edged(height)
+
+
+@_of_films(
+    "edges shifted in etching or development",
+    {"bias_um": Parameter("µm", -0.03, 0.03, 0.005, tried=(0.004, -0.004))},
+    stage="development",
+    acts_on="height",
+    source="lateral etching at a rate of its own, the same at every dose and in every surrounding",
+    separating="write one layout at five doses: a bias is the same at each",
+)
+def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H looked up at a distance of the bias inward: along the normal, edges move outward by it."""
+    normal = add_blur(height, height.new_tensor(_NORMAL_UM**2), context.pitch_um, 5 * _NORMAL_UM)
+    along_y, along_x = (slope[0, 0] for slope in gradient(normal, context.pitch_um))
+    steepness = torch.sqrt(
+        along_y**2 + along_x**2 + (FLATTEST * context.full_height_um / context.pitch_um) ** 2
+    )
+    share = values["bias_um"] / steepness
+    return add_warp(height, share * along_y, share * along_x, context.pitch_um)
