@@ -44,8 +44,8 @@ def _radius_px(film: torch.Tensor) -> float:
 def test_a_bias_moves_every_edge_by_itself(bias_um: float) -> None:
     film = _film(_disc(25))
     moved = get_effect("etch-bias")(film, {"bias_um": bias_um}, _context(film))
-    # The film is looked up by cubics, with a rim one pixel wide: 1 % of a shift.
-    assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_um / PITCH_UM, rel=0.01)
+    # The film is looked up by cubics, its rim is one pixel wide: some hundredths of a pixel.
+    assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_um / PITCH_UM, abs=0.03)
 
 
 def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
