@@ -15,6 +15,7 @@ from litho_models.models.parts import FLATTEST, etch
 # Blur of a film that gives its edges a normal, µm.
 _NORMAL_UM = 0.012
 _DIFFUSION_REACH_UM = 0.2
+_RIM_UM = 0.006
 
 _of_films = partial(entry, role="process", of_films=True)
 
@@ -49,11 +50,13 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     """The film blurred by a Gaussian of variance s², and its edge put where the blurred film is one half."""
     full, pitch = context.full_height_um, context.pitch_um
 
-    def edged(field: Tensor) -> Tensor:
-        return full * etch(functional.pad(field / full, (1,) * 4, mode="replicate"), 0.5, 0.0, pitch)
+    def edged(variance_um2: Tensor) -> Tensor:
+        # A sharp rim says too little of where within a pixel its edge is: both are blurred by some.
+        blurred = add_blur(height / full, variance_um2 + _RIM_UM**2, pitch, _DIFFUSION_REACH_UM)
+        return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, pitch)
 
-    blurred = add_blur(height, values["variance_um2"], pitch, _DIFFUSION_REACH_UM)
-    return height + edged(blurred) - edged(height)
+    variance = values["variance_um2"]
+    return height + edged(variance) - edged(0 * variance)
 
 
 @_of_films(

@@ -43,7 +43,7 @@ def choose_base(
     *,
     steps: int | None,
     cache: Path,
-    fields: Mapping[str, Any],
+    fields: Mapping[str, Any] = {},
 ) -> Base:
     """The base by what was asked for; a network is trained without each fold.
 

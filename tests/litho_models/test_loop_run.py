@@ -320,7 +320,7 @@ def test_a_base_is_asked_for_by_name_or_the_best_is_taken(
     study = replace(study_of(scans), scans=())
 
     def chosen(base: str) -> tuple[str, list[str]]:
-        found = bases.choose_base(base, scans, study, steps=None, cache=tmp_path, fields={})
+        found = bases.choose_base(base, scans, study, steps=None, cache=tmp_path)
         return found.name, [*found.others]
 
     assert chosen("affine") == ("affine", [])
