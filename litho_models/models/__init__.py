@@ -31,7 +31,7 @@ MODELS: dict[str, type[Simulator]] = {
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
     """Take a model by its name from now on, in every function and command of this process.
 
-    To work in several processes, call this in a module that every process imports.
+    In a plug-in, of every process of a command.
 
     Raises:
         InputError: no name of its own, or one that is taken.
