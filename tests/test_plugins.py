@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from operator import methodcaller
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ if __name__ == "__main__":
     from litho_design.tasks.task import registered_task
     print(registered_task("colours-in-planes"))
 """
-OWN = "def twice(number):\n    return 2 * number\n"
+OWN = "class Number(int):\n    def twice(self):\n        return 2 * self\n"
 
 
 @pytest.fixture
@@ -115,9 +116,9 @@ def test_a_file_is_loaded_once_and_in_every_worker(tmp_path: Path, unknown: None
     file.write_text(OWN)
     for _ in range(2):
         plugins.load_plugins([file])
-    from own_numbers import twice  # type: ignore[import-not-found]
-
-    assert sorted(result for _, result in run_jobs(twice, [1, 2, 3], Workers(2))) == [2, 4, 6]
+    numbers = [sys.modules["own_numbers"].Number(one) for one in (1, 2, 3)]
+    done = run_jobs(methodcaller("twice"), numbers, Workers(2))
+    assert sorted(result for _, result in done) == [2, 4, 6]
     version = run_facts()["versions"]["plug-in own_numbers.py"]
     file.write_text(f"{OWN}# Changed.\n")
     plugins._LOADED.clear()
