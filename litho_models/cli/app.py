@@ -14,7 +14,7 @@ from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
-from litho_models.cli.loop import check, close_loop, next_print
+from litho_models.cli.loop import FixOption, FreeOption, check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
@@ -74,7 +74,8 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="FIELD=VALUE of the training, such as learning_rate=0.001; repeatable",
+        help="FIELD=VALUE of the training or the model, such as learning_rate=0.001 or spot.sigma_um=0.3; "
+        "repeatable",
     ),
 ]
 
@@ -87,7 +88,7 @@ def train(
         str,
         typer.Option(
             help="identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
-            "e-beam, pbl or fno"
+            "e-beam, projection, laser-writer, dmd-grayscale, pbl or fno"
         ),
     ],
     out: Out,
@@ -98,6 +99,8 @@ def train(
     weights: WeightsOption = "uniform",
     seed: Seed = 0,
     set_: SetOption = None,
+    fix: FixOption = None,
+    free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
         typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
@@ -108,10 +111,13 @@ def train(
     Example: litho-models train prints.zarr --model pbl --out run
     """
     from litho_models.frozen.readme import bounds_text
+    from litho_models.models import fixed_numbers
 
     settings = _training(
         set_, recipe=recipe, variant=variant, seed=seed, weights=weights, steps=steps, precision=precision
     )
+    if fix or free:
+        settings["fixed"] = fixed_numbers(model, fix or (), free or ())
     run = litho_models.train(
         store, model, out, recipe=settings.pop("recipe"), settings=settings, use_lock_box=use_lock_box
     )

@@ -12,6 +12,15 @@ from litho_data.commands.app import DaskOption, WorkersOption
 from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
+FixOption = Annotated[
+    list[str] | None,
+    typer.Option("--fix", help="a number of the model that no fit changes, such as eta; repeatable"),
+]
+FreeOption = Annotated[
+    list[str] | None,
+    typer.Option("--free", help="a number that is fitted though usually it is not; repeatable"),
+]
+
 
 @with_paper_copies
 def close_loop(
@@ -33,8 +42,10 @@ def close_loop(
     ] = "auto",
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="FIELD=VALUE of a small base, such as spots=1; repeatable"),
+        typer.Option("--set", help="FIELD=VALUE of a small base, such as spot.sigma_um=0.3; repeatable"),
     ] = None,
+    fix: FixOption = None,
+    free: FreeOption = None,
     folds: Annotated[int, typer.Option("--folds", min=2, help="by scan")] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
@@ -65,13 +76,17 @@ def close_loop(
     Example: litho-models close-loop prints.zarr --out loop
     """
     from litho_models.loop.report import decision_text, effect_text, verdict_text
+    from litho_models.models import fixed_numbers
 
+    settings = assigned(set_ or ())
+    if fix or free:
+        settings["fixed"] = fixed_numbers(base, fix or (), free or ())
     result = litho_models.close_loop(
         stores[0],
         out,
         new_prints=stores[1:],
         base=base,
-        base_settings=assigned(set_ or ()),
+        base_settings=settings,
         folds=folds,
         nested=nested,
         inject=tuple(inject or ()),

@@ -51,7 +51,7 @@ def choose_base(
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
         study: settings: folds, seed, workers, report.
         steps: optimiser steps of a network, the recipe's if None; ``cache``: where its trainings are kept.
-        fields: settings of a small model, such as ``{"spots": 1}``.
+        fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
         InputError: no such base, one of another pitch, or settings of one that is not a small model.

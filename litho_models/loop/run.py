@@ -62,7 +62,7 @@ def close_loop(
     Args:
         store: made by ``litho-data build``.
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
-        base_settings: fields of the config of a small base, such as ``{"spots": 1}``.
+        base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
         folds: of scans; each scan is predicted by fits that have not seen its fold.
         nested: also choose everything anew without each fold, or each print, and judge it there.
         inject: ``NAME=AMOUNT`` each, planted in copies of the scans: is it found?

@@ -19,7 +19,7 @@ from tests.litho_models.prints import write_store
 
 FILM_UM, PITCH_UM = 0.22, 0.004
 GEOMETRY = {"pitch_um": PITCH_UM, "levels": 17, "level_height_um": FILM_UM / 16}
-BARE = {"spots": 1, "resist": "threshold", "diffusion": False, "etch_bias": False}
+BARE = {"parts": ("spot", "etch"), "spot.sigma_um": 0.02, "fixed": ("etch.bias_px",)}
 
 
 def _context(layout_um: torch.Tensor) -> FieldContext:
@@ -68,8 +68,8 @@ def test_electrons_come_back_where_something_is_written() -> None:
 
 def _prints(count: int, bias_um: float) -> list[PrintedScan]:
     """Random films of a spot, a threshold and a shift of edges, with a noise of coverage."""
-    printer = build_model("e-beam", **(BARE | {"etch_bias": True}), forward_um=0.014, **GEOMETRY)
-    printer.raw_bias_um.data = printer.ranges["raw_bias_um"].raw(bias_um)
+    numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_um / PITCH_UM}
+    printer = build_model("e-beam", **(BARE | numbers), **GEOMETRY)
     scans = []
     for number in range(count):
         rng = np.random.default_rng([5, number])
@@ -108,7 +108,7 @@ def test_the_loop_names_the_bias_that_a_bare_printer_lacks(tmp_path: Path) -> No
 
 def test_settings_that_a_base_does_not_have_are_refused(tmp_path: Path) -> None:
     store = write_store(tmp_path / "films.zarr", _prints(2, 0.001), instrument="sem")
-    for settings in ({"spot_count": 1}, {"spots": 7}):
+    for settings in ({"spot_count": 1}, {"spot.width": 1}, {"parts": ["spots"]}):
         with pytest.raises(InputError, match="spot"):
             close_loop(store, tmp_path / "loop", base="e-beam", base_settings=settings)
     with pytest.raises(InputError, match="small model"):
