@@ -10,13 +10,13 @@ import numpy as np
 
 from litho_data.reports.page import Page, sentences
 from litho_data.reports.pictures import new_figure
-from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding
+from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding, Stage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
-_STAGES = {"base": "base", "causes": "with the causes", "all": "corrected"}
+_STAGES: dict[Stage, str] = {"base": "base", "causes": "with the causes", "all": "corrected"}
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
