@@ -11,8 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.fits import State, Study, without_terms
-from litho_models.loop.model import Placed, Twin
+from litho_models.loop.fits import State, Study, held_out_maps, without_terms
 from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -28,24 +27,16 @@ def reshaped_gain(without: State, state: State, study: Study) -> float:
         without, state: the model without and with the cause.
     """
     grams = []
-    before, after = _of_folds(without.twin, without.per_fold), _of_folds(state.twin, state.per_fold)
-    for at, window in enumerate(study.windows):
-        fold = study.fold_of[at]
-        prediction = after[fold].height(window, fold)
-        change = prediction - before[fold].height(window, fold)
-        maps = _shapes(change, prediction, window)
-        columns = np.column_stack([state.held_out_um[at], *map(window.at_sample, maps)])
-        freed = without_terms(columns, window, prediction)
+    before, after = (held_out_maps(one.per_fold, study, study.windows) for one in (without, state))
+    for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
+        maps = _shapes(own - other, own, window)
+        freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    products = Products(np.stack(grams), {ALL: ("",) * len(grams)})
+    products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
     taken = left - products.held_out([Block(tuple(range(1, count)), ALL, _SHRINKING)], study.fold_of)
     return float(taken.mean()) * NM_PER_UM**2
-
-
-def _of_folds(twin: Twin, vectors: np.ndarray) -> list[Placed]:
-    return [twin.at(vector).placed() for vector in vectors]
 
 
 def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:

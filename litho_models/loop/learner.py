@@ -43,12 +43,11 @@ class Rest:
 
     Attributes:
         gains_nm2: (scans,) taken from the squared error of each scan by the ridge that has not seen it.
-        squares_nm2: (scans,) the squared error itself; both free of ``k`` terms per scan.
+        squares_nm2: (scans,) the squared error itself; both free of what single scans may add.
     """
 
     gains_nm2: np.ndarray
     squares_nm2: np.ndarray
-    k: int
 
     @property
     def mean_nm2(self) -> float:
@@ -67,13 +66,14 @@ class Rest:
     @property
     def most_nm(self) -> float:
         """The root of the upper end of the interval: what the form of the model may be wrong by, rms."""
-        interval_nm2 = self.ci95_nm2
-        return float(np.sqrt(max(self.mean_nm2 if interval_nm2 is None else interval_nm2[1], 0.0)))
+        _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
+        return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
         """Whether something is left that can be learned: more than 1 %, and an interval without zero."""
-        return self.share > SMALLEST_SHARE and self.ci95_nm2 is not None and self.ci95_nm2[0] > 0
+        low, _ = self.ci95_nm2 or (0.0, None)
+        return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
@@ -97,11 +97,9 @@ class Learner:
             orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
             for scan, own in zip(study.scans, predictions, strict=True)
         ]
+        pairs = zip(self._rows_of, self._bases, strict=True)
         self._grams = np.stack(
-            [
-                (_gram(own) - gram_inside(own.T, basis)) / len(basis)
-                for own, basis in zip(self._rows_of, self._bases, strict=True)
-            ]
+            [(_gram(own) - gram_inside(own.T, basis)) / len(basis) for own, basis in pairs]
         )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
@@ -113,16 +111,15 @@ class Learner:
         scans, count = self._study.scans, self._grams.shape[1]
         grams = np.zeros((len(scans), 1 + count, 1 + count))
         grams[:, 1:, 1:] = self._grams
-        for scan, own, rows, basis, gram in zip(
-            scans, predictions, self._rows_of, self._bases, grams, strict=True
-        ):
+        parts = zip(scans, predictions, self._rows_of, self._bases, grams, strict=True)
+        for scan, own, rows, basis, gram in parts:
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
             gram[0, 0] = np.mean(residual**2)
             gram[0, 1:] = gram[1:, 0] = rows @ residual / len(residual)
         left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
-        return Rest(squares - left, squares, self._bases[0].shape[1])
+        return Rest(squares - left, squares)
 
     def _rows(
         self, model: Features, scan: PreparedScan, varied: Sequence[Callable[[PreparedScan], float]]
@@ -157,13 +154,12 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     """Mean squared residual (scans,) by ridges fitted, and their weight chosen, without each scan's fold."""
-    left = np.empty(len(grams))
+    left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
     blocks = [Block(columns, ALL, shrinking) for shrinking in _SHRINKING]
-    products = Products(grams, {ALL: ("",) * len(grams)})
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
-        inner, inner_of = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
+        inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
         # A single scan has nothing to choose on: the most cautious.

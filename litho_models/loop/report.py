@@ -88,7 +88,7 @@ def said(about: str, one: object) -> str:
 
 def _headline(result: CloseLoop) -> list[ErrorRow]:
     """Errors of the stages, k = 1, with the shared measurement."""
-    return [row for row in map(result.error, _STAGES) if row is not None]
+    return [row for row in result.errors if row.is_headline]
 
 
 def _bars(result: CloseLoop) -> Figure:

@@ -32,13 +32,10 @@ from litho_models.scan_terms import (
     parameter_names,
     terms_of_effect,
 )
-from litho_models.scoring.statistics import by_print, one_sided_flip_p
+from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
 
 _DATUM: Terms = frozenset({"offset"})
 _SMOOTH: Terms = frozenset({"offset", "bow"})
-# A period of lines is looked for at all frequencies at once.
-_PERIOD_P = 1e-3
-_DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -96,17 +93,14 @@ class SingleScans:
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
         # Where scans of one print are alike, the printer may have done it too.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
-        return ScanFinding(
-            name=name,
-            title=effect.title,
+        spread = zip(effect.parameters.items(), values.T, strict=True)
+        return ScanFinding.of(
+            name,
+            _evidence(judgement, before, after),
             role="undetermined" if unclear else effect.role,
             seen=judgement.passed(),
-            evidence=_evidence(judgement, before, after),
             p=judgement.p,
-            spread={
-                parameter: self._spread(column, effect.parameters[parameter].unit)
-                for parameter, column in zip(effect.parameters, values.T, strict=True)
-            },
+            spread={parameter: self._spread(own, facts.unit) for (parameter, facts), own in spread},
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
@@ -124,9 +118,9 @@ class SingleScans:
     def _spread(self, values: np.ndarray, unit: str) -> Strength:
         """Standard deviation over scans with its bootstrap interval."""
         count = len(values)
-        draws = np.random.default_rng(self.study.seed).integers(0, count, (_DRAWS, count))
-        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975])
-        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(float(low), float(high)))
+        draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
+        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
+        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
         """Offsets of lines, along the scan and along the layout: against columns, then against each other.
@@ -158,12 +152,10 @@ class SingleScans:
             deviation = np.sqrt(np.maximum(gains[name], 0).mean()) / NM_PER_UM
             taken = f"{gains[name].mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
             found.append(
-                ScanFinding(
-                    name=name,
-                    title=get_effect(name).title,
-                    role=get_effect(name).role,
+                ScanFinding.of(
+                    name,
+                    "; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
                     seen=not reasons,
-                    evidence="; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
                     p=excess_p,
                     spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
                     confusable_with=[] if beaten or better else [other],
@@ -188,7 +180,10 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """The period that the means of lines have in common, such as that of mains hum, in words."""
+        """The period that the means of lines have in common, such as that of mains hum, in words.
+
+        It is looked for at all frequencies at once.
+        """
         (term,) = line_terms(terms_of_effect(name))
         means = []
         for scan, residual in zip(self.scans, self._smooth_um, strict=True):
@@ -197,7 +192,7 @@ class SingleScans:
             count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
             means.append(total / np.maximum(count, 1))
         found = line_period(means, self.scans[0].stored.pitch_um)
-        if found is None or found.p > _PERIOD_P:
+        if found is None or found.p > 1e-3:
             return ""
         share = 100 * found.share
         return (
