@@ -15,10 +15,6 @@ from litho_models.loop.fits import State, Study, held_out_maps, without_terms
 from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-_BLURS_UM = (0.2, 0.6, 1.6)
-# Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.
-_SHRINKING = 0.02
-
 
 def reshaped_gain(without: State, state: State, study: Study) -> float:
     """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
@@ -32,17 +28,18 @@ def reshaped_gain(without: State, state: State, study: Study) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
+    # Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
-    taken = left - products.held_out([Block(tuple(range(1, count)), ALL, _SHRINKING)], study.fold_of)
+    taken = left - products.held_out([Block(tuple(range(1, count)), ALL, 0.02)], study.fold_of)
     return float(taken.mean()) * NM_PER_UM**2
 
 
 def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:
     """A change of the prediction (y, x), µm, and the same in other shapes."""
     pitch = window.context.pitch_um
-    blurred = [gaussian_filter(change, sigma / pitch) for sigma in _BLURS_UM]
+    blurred = [gaussian_filter(change, sigma / pitch) for sigma in (0.2, 0.6, 1.6)]
     layout = np.asarray(window.stored.layout_um, np.float64)
     near, far = (gaussian_filter(layout, sigma / pitch) for sigma in (0.6, 2.0))
     relative = prediction - prediction.mean()

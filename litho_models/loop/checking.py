@@ -17,11 +17,6 @@ from litho_models.scan_terms.grouped import ALL
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
 # more.
 FORM_SHARE = 0.15
-# Of what is left to be explained: less is the little that any columns take of causes that are still missing.
-LEFT_SHARE = 0.3
-# A cause that gains this little beside another may be an error of the other's formula: it is, if the other's
-# change in another shape would take half of what it takes, or if the other is a law, which only comes close.
-SMALL_SHARE, REPEATED_SHARE = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -72,7 +67,8 @@ class Check:
         if exhausted and share > FORM_SHARE:
             text = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
             return Checked(cause, share, text)
-        if share > FORM_SHARE and reshaped_nm2 > LEFT_SHARE * self.left_nm2:
+        # A small part of what is left is the little that any columns take of causes that are still missing.
+        if share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
             return Checked(cause, share, f"only resembles the cause: {taken}")
         if law := self._law_instead(without):
@@ -80,14 +76,18 @@ class Check:
         return Checked(cause, share, "")
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """A much larger law, or cause whose change in another shape takes what this one does; or nothing."""
+        """A much larger law, or cause whose change in another shape takes half of what this one does.
+
+        A cause that gains a tenth of another or less may be an error of the other's formula, and a law only
+        comes close. Empty if there is none.
+        """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
-            if gain_nm2 < SMALL_SHARE * other.judgement.gain_nm2:
+            if gain_nm2 < 0.1 * other.judgement.gain_nm2:
                 if get_effect(other.name).knowledge == "law":
                     return other.name
                 neither = without.without(other.name, self.study)
-                if reshaped_gain(neither, without, self.study) >= REPEATED_SHARE * gain_nm2:
+                if reshaped_gain(neither, without, self.study) >= 0.5 * gain_nm2:
                     return other.name
         return ""
 

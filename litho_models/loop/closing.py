@@ -28,9 +28,6 @@ from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 
-# A law is a short formula: two terms at most.
-MOST_LAWS, MOST_TABLES = 2, 2
-
 
 @dataclass(frozen=True)
 class Chosen:
@@ -148,9 +145,10 @@ def _chosen(
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
-        lawful = search(named.state, study, laws, MOST_LAWS, secants)
+        # Two terms at most, so that a law is a short formula.
+        lawful = search(named.state, study, laws, 2, secants)
         study.report("describing what is left")
-        described = describe(lawful.state, study, tables, MOST_TABLES, secants)
+        described = describe(lawful.state, study, tables, 2, secants)
         if not named.causes:
             return Chosen(named, failed, lawful, described)
         in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)

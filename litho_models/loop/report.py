@@ -10,13 +10,12 @@ import numpy as np
 
 from litho_data.reports.page import Page, sentences
 from litho_data.reports.pictures import new_figure
-from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding, Stage
+from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
-_STAGES: dict[Stage, str] = {"base": "base", "causes": "with the causes", "all": "corrected"}
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
@@ -30,7 +29,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     )
     page.verdict(said("verdict", result))
     page.tiles(
-        [(f"{row.mae_nm:.2f} nm", f"{_STAGES[row.model]}, k = {row.k:g}") for row in _headline(result)]
+        [(f"{row.mae_nm:.2f} nm", f"{said('stage', row.model)}, k = {row.k:g}") for row in _headline(result)]
     )
     page.figure(_bars(result), "Error on held-out scans, zero of each scan free. Grey: the base.")
     if result.effects:
@@ -93,7 +92,7 @@ def _headline(result: CloseLoop) -> list[ErrorRow]:
 
 def _bars(result: CloseLoop) -> Figure:
     rows = [row for row in (result.error("base", measurement="published"), *_headline(result)) if row]
-    labels = ["base, published protocol", *(_STAGES[row.model] for row in rows[1:])]
+    labels = ["base, published protocol", *(said("stage", row.model) for row in rows[1:])]
     figure = new_figure(9, 0.45 * len(rows) + 1.1)
     axes = figure.subplots()
     at = np.arange(len(rows))[::-1]

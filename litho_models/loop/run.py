@@ -32,7 +32,6 @@ from litho_models.loop.single_scans import SingleScans
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
-_HOLDS = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
 Nested = Literal["folds", "prints"]
 # What is made of a closed loop before it is written: its record, and records to be written beside it.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
@@ -84,8 +83,9 @@ def close_loop(
         "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
+    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
     with (
-        whole_folder(out, *_HOLDS, record=CloseLoop.FILE_NAME, facts=facts) as folder,
+        whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
     ):
         study = Study((), dealt(development, folds, seed), seed, places, report)

@@ -26,12 +26,8 @@ from litho_models.loop.screening import (
 )
 from litho_models.scan_terms.grouped import ALL, Labels
 
-MOST_EFFECTS = 8
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
 WORTH_FITTING = 0.3
-# Rivals are fitted beside the best if they promise this share of its gain, and change much the same.
-RIVAL_SHARE, RIVAL_COSINE = 0.3, 0.5
-RIVALS = 3
 # What changes the held-out prediction so alike cannot be told apart by its shape.
 SAME_COSINE = 0.8
 
@@ -81,7 +77,7 @@ def search(
     start: State,
     study: Study,
     candidates: Sequence[Effect],
-    most: int = MOST_EFFECTS,
+    most: int = 8,
     secants: Secants | None = None,
 ) -> Found:
     """Add effects to a fitted model, at most so many.
@@ -190,14 +186,12 @@ def _best_grouping(gains: Mapping[str, float], numbers: Mapping[str, int]) -> st
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """Those that promise about as much as the best, and change much the same."""
+    """The three that promise most beside the best, a third of its gain or more, and change much the same."""
     return [
         one
         for one in standing
-        if one is not best
-        and one.gain_nm2 >= RIVAL_SHARE * best.gain_nm2
-        and abs(screening.cosine(best, one)) >= RIVAL_COSINE
-    ][:RIVALS]
+        if one is not best and one.gain_nm2 >= 0.3 * best.gain_nm2 and abs(screening.cosine(best, one)) >= 0.5
+    ][:3]
 
 
 def _alike(

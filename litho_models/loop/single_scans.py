@@ -34,7 +34,6 @@ from litho_models.scan_terms import (
 )
 from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
 
-_DATUM: Terms = frozenset({"offset"})
 _SMOOTH: Terms = frozenset({"offset", "bow"})
 
 
@@ -67,13 +66,15 @@ class SingleScans:
 
     def findings(self) -> list[ScanFinding]:
         """Each effect of single scans given those that were seen before it; offsets of lines come last."""
-        accepted, found = _DATUM, []
+        accepted: Terms = frozenset({"offset"})
+        found: list[ScanFinding] = []
         names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
         lines = [name for name in names if line_terms(terms_of_effect(name))]
         for name in names:
             if name not in lines:
                 found.append(self._of_terms(name, accepted))
-                accepted |= terms_of_effect(name) if found[-1].seen else _DATUM
+                if found[-1].seen:
+                    accepted |= terms_of_effect(name)
         return found + self._of_lines(lines, accepted | _SMOOTH)
 
     def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> Freed:
