@@ -186,11 +186,11 @@ class HeldOut:
         """The maps with the smooth background of the training scans: the published protocol."""
         found, fold_of = list(maps), self.settings.fold_of
         for fold, twin in enumerate(self.closed.plain.per_fold):
-            placed, own = twin.placed(), np.flatnonzero(fold_of != fold)
+            placed, own = twin.placed(), np.flatnonzero(fold_of != fold).tolist()
             learned = learn_background(
                 [self.scans[i] for i in own], [placed.height(self.closed.original[i]) for i in own]
             )
-            for i in np.flatnonzero(fold_of == fold):
+            for i in np.flatnonzero(fold_of == fold).tolist():
                 found[i] = Prediction.beside(learned, maps[i]).map_um
         return found
 

@@ -168,7 +168,7 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
     per_fold = []
     for fold in study.folds:
-        own = np.flatnonzero(study.fold_of != fold)
+        own = np.flatnonzero(study.fold_of != fold).tolist()
         per_fold.append(_without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own]))
     maps = held_out_maps(per_fold, study, windows)
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]

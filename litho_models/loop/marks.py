@@ -36,9 +36,7 @@ def marks(
         for scan, own in zip(scans, maps_um, strict=True)
     ]
     found = [_scars(scans, residuals), _short_lines(scans, maps_um, residuals), _bends(scans)]
-    if rounding_um is not None:
-        found.append(_rounding(list(rounding_um.values())))
-    return found
+    return found if rounding_um is None else [*found, _rounding([*rounding_um.values()])]
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
@@ -93,12 +91,14 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
-    boxes = find_objects(numbered)
-    # One that stands out on fewer pixels is noise; a scratch is four times as long as wide.
-    large = np.bincount(numbered.ravel(), minlength=len(boxes) + 1)[1:] >= 9
-    height, width = np.array([[part.stop - part.start for part in box] for box in boxes]).reshape(-1, 2).T
-    counts = ((large & (width >= 4 * height)).sum(), (large & (height >= 4 * width)).sum())
-    return counts[:: -1 if axis_along(scan.line) == 0 else 1]
+    sizes, along, across = np.bincount(numbered.ravel()), 0, 0
+    for number, box in enumerate(find_objects(numbered), 1):
+        height, width = (part.stop - part.start for part in box)
+        # On fewer pixels it is noise; a scratch is four times as long as wide.
+        if sizes[number] >= 9:
+            along += width >= 4 * height
+            across += height >= 4 * width
+    return (across, along) if axis_along(scan.line) == 0 else (along, across)
 
 
 def _short_lines(

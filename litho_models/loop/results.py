@@ -146,7 +146,7 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
     """Numbers of an effect with intervals from what each print (or scan) asks for; of a table alone."""
     from scipy.stats import t
 
-    facts, found = get_effect(cause.name).parameters, {}
+    facts, found = get_effect(cause.name).parameters, dict[str, list[Strength]]()
 
     def add(parameter: str, label: str, value: float, half: float = 0.0) -> None:
         ci95 = (value - half, value + half) if half else None
