@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, get_effect, register_effect
 from litho_models.loop import closing
 from litho_models.loop.record import CloseLoop
-from litho_models.scan_terms import SCAN_TERMS
+from litho_models.scan_terms import SCAN_TERMS, measurement_fit
 from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import write_store
 
