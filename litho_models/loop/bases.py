@@ -22,6 +22,8 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
+# Bases that compete where none is asked for, the first one the form of the paper's physics.
+_COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,7 @@ def choose_base(
 def _best(scans: Sequence[PrintedScan], study: Study) -> Base:
     prepared = prepare_scans(scans)
     plain = replace(study, scans=prepared)
-    # The first one is the form of the paper's physics.
-    built = {name: _built(name, scans[0]) for name in ("physics", "affine-mtf", "blur-table")}
+    built = {name: _built(name, scans[0]) for name in _COMPETING}
     errors = {}
     for name, one in built.items():
         study.report(f"trying {name} as the base")

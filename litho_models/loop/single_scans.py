@@ -34,8 +34,6 @@ from litho_models.scan_terms import (
 )
 from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
 
-_SMOOTH: Terms = frozenset({"offset", "bow"})
-
 
 @dataclass(frozen=True)
 class Freed:
@@ -75,7 +73,7 @@ class SingleScans:
                 found.append(self._of_terms(name, accepted))
                 if found[-1].seen:
                     accepted |= terms_of_effect(name)
-        return found + self._of_lines(lines, accepted | _SMOOTH)
+        return found + self._of_lines(lines, accepted | {"bow"})
 
     def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> Freed:
         blocks = Blocks(seed=self.study.seed)
@@ -205,7 +203,7 @@ class SingleScans:
     def _smooth_um(self) -> list[np.ndarray]:
         """Residual (y, x) of each scan without datum and bow, 0 where not measured."""
         return [
-            freed_um(scan.stored.height_um, own, scan.usable, _SMOOTH)
+            freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)
         ]
 
