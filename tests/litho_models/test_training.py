@@ -417,7 +417,7 @@ def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch
     # Unequal weights of the crops: a mean of means would show.
     scans[0].valid[:, :40] = False
     config = TrainingConfig(batch=4, crop_px=32)
-    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0, "uniform")
+    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
 
     def of_process(rank, count):
         torch.manual_seed(0)
