@@ -69,7 +69,7 @@ Seed = Annotated[int, option("seed of weights, crops and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
-        "FIELD=VALUE of the training or the model, such as learning_rate=0.001 or spot.sigma_um=0.3; repeatable",
+        "FIELD=VALUE of training or model, such as learning_rate=0.001 or spot.sigma_um=0.3; repeatable",
         "--set",
     ),
 ]
