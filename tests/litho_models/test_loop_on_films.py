@@ -40,16 +40,16 @@ def _radius_px(film: torch.Tensor) -> float:
     return float(np.sqrt(float(film.sum()) / FILM_UM / np.pi))
 
 
-@pytest.mark.parametrize("bias_um", [-0.012, 0.004, 0.012])
-def test_a_bias_moves_every_edge_by_itself(bias_um: float) -> None:
+@pytest.mark.parametrize("bias_px", [-3.0, 1.0, 3.0])
+def test_a_bias_moves_every_edge_by_itself(bias_px: float) -> None:
     film = _film(_disc(25))
-    moved = get_effect("etch-bias")(film, {"bias_um": bias_um}, _context(film))
+    moved = get_effect("etch-bias")(film, {"bias_px": bias_px}, _context(film))
     # The film is looked up by cubics, its rim is one pixel wide: some hundredths of a pixel.
-    assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_um / PITCH_UM, abs=0.03)
+    assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_px, abs=0.03)
 
 
 def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
-    values, disc = {"variance_um2": (3 * PITCH_UM) ** 2}, _film(_disc(20))
+    values, disc = {"variance_px2": 3**2}, _film(_disc(20))
     spread = get_effect("resist-diffusion")
     # A disc blurred by s is one half where its radius is less by s² / 2R, to second order in s / R.
     shrunk_px = _radius_px(disc) - _radius_px(spread(disc, values, _context(disc)))
@@ -60,15 +60,15 @@ def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -
 
 def test_electrons_come_back_where_something_is_written() -> None:
     layout = _film(_disc(20))
-    dose = get_effect("electron-backscatter")(layout, {"weight": 0.5, "length_um": 0.03}, _context(layout))
+    dose = get_effect("electron-backscatter")(layout, {"weight": 0.5, "length_px": 8.0}, _context(layout))
     # They are spread and not lost, but for what goes beyond the field, four of their lengths away.
     assert float(dose.sum()) == pytest.approx(float(layout.sum()), rel=1e-3)
     assert 0 < float(dose[0, 0, 48, 48 + 26]) < FILM_UM / 3
 
 
-def _prints(count: int, bias_um: float) -> list[PrintedScan]:
+def _prints(count: int, bias_px: float) -> list[PrintedScan]:
     """Random films of a spot, a threshold and a shift of edges, with a noise of coverage."""
-    numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_um / PITCH_UM}
+    numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_px}
     printer = build_model("e-beam", **(BARE | numbers), **GEOMETRY)
     scans = []
     for number in range(count):
@@ -89,12 +89,12 @@ def _prints(count: int, bias_um: float) -> list[PrintedScan]:
 
 @pytest.mark.pictures
 def test_the_loop_names_the_bias_that_a_bare_printer_lacks(tmp_path: Path) -> None:
-    scans = _prints(10, -0.014)
+    scans = _prints(10, -3.5)
     store = write_store(tmp_path / "films.zarr", scans, instrument="sem")
     result = close_loop(store, tmp_path / "loop", base="e-beam", base_settings=BARE, folds=2)
     assert [one.name for one in result.effects] == ["etch-bias"]
-    (found,) = result.effects[0].strengths["bias_um"]
-    assert found.value == pytest.approx(-0.014, abs=0.003)
+    (found,) = result.effects[0].strengths["bias_px"]
+    assert found.value == pytest.approx(-3.5, abs=0.75)
     before, after = result.error("base"), result.error("all")
     assert before is not None
     assert after is not None
@@ -107,7 +107,7 @@ def test_the_loop_names_the_bias_that_a_bare_printer_lacks(tmp_path: Path) -> No
 
 
 def test_settings_that_a_base_does_not_have_are_refused(tmp_path: Path) -> None:
-    store = write_store(tmp_path / "films.zarr", _prints(2, 0.001), instrument="sem")
+    store = write_store(tmp_path / "films.zarr", _prints(2, 0.2), instrument="sem")
     for settings in ({"spot_count": 1}, {"spot.width": 1}, {"parts": ["spots"]}):
         with pytest.raises(InputError, match="spot"):
             close_loop(store, tmp_path / "loop", base="e-beam", base_settings=settings)
