@@ -35,6 +35,7 @@ class TrainingConfig(BaseModel):
 
     recipe: Recipe = "fast"
     variant: Variant = "default"
+    model: dict[str, Any] = Field(default_factory=dict, description="settings of the model that is trained")
     seed: int = Field(0, ge=0, lt=2**63)
     steps: int = Field(1000, ge=1, le=_MOST, description="optimiser steps")
     rounds: int = Field(
