@@ -14,6 +14,8 @@ from litho_data.virtual_fab.films import FilmKnobs
 from litho_models.effects import CATALOGUE
 from litho_models.models import build_model
 
+ANSWERS = [(["etch-bias"], True), ([], False), (["etch-bias", "more"], False)]
+
 
 @pytest.mark.parametrize("process", sorted(BASES))
 def test_seven_of_ten_trials_have_one_cause_which_the_loop_could_name(process: str) -> None:
