@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from litho_models.models import build_model as build_model
     from litho_models.models import register_simulator as register_simulator
     from litho_models.models.authors import model_of_authors as model_of_authors
-    from litho_models.models.parts import register_part as register_part
     from litho_models.noise import analyse_noise as analyse_noise
     from litho_models.planning.rounds import close_loop as close_loop
     from litho_models.scan_terms import register_scan_term as register_scan_term

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_models import load_frozen
 from litho_models.cli.app import main
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.models import MODELS, build_model, fixed_numbers
@@ -169,8 +170,9 @@ def test_a_fixed_number_stays_and_a_freed_one_does_not() -> None:
     for fixed in ((), ("spot.sigma_um",)):
         model = printer("laser-writer", **geometry, **{"spot.sigma_um": 0.4}, fixed=fixed)
         fit_small_model(model, scans, "none")
-        assert (float(model.values["spot.sigma_um"]) == pytest.approx(0.4)) == bool(fixed)
-        assert float(model.values["transfer.selectivity"]) != pytest.approx(1.0)
+        values = {name: value.item() for name, value in model.values.items()}
+        assert (values["spot.sigma_um"] == pytest.approx(0.4)) == bool(fixed)
+        assert values["transfer.selectivity"] != pytest.approx(1.0)
     assert fixed_numbers("e-beam", ["etch.bias_px"], ["etch.threshold"]) == ["etch.bias_px"]
     with pytest.raises(InputError, match="to fix"):
         build_model("physics", fixed=("nonsense",))
@@ -188,9 +190,11 @@ def test_numbers_of_a_model_are_set_and_fixed_on_the_command_line(
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 0
-    card = json.loads((tmp_path / "run" / "model" / "card.json").read_text())
-    assert card["config"]["numbers"]["spot.sigma_um"] == 0.35
-    assert card["config"]["fixed"] == ["spot.sigma_um"]
+    settings = json.loads((tmp_path / "run" / "run.json").read_text())["config"]["model"]
+    assert settings == {"spot.sigma_um": 0.35, "fixed": ["spot.sigma_um"]}
+    model = load_frozen(tmp_path / "run" / "model").simulator
+    assert isinstance(model, Printer)
+    assert float(model.values["spot.sigma_um"].detach()) == pytest.approx(0.35)
 
 
 @pytest.mark.parametrize("name", [name for name, one in MODELS.items() if issubclass(one, Printer)])
