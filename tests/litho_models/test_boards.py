@@ -113,7 +113,8 @@ def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monke
     """As anyone's is run; what the command prints is what the scoreboard says."""
     words = ["litho-models", "board", "judge", str(board), "--out", str(tmp_path / "j"), "--loop", EXAMPLE]
     monkeypatch.setattr(sys, "argv", words)
-    main()
+    with pytest.raises(SystemExit, match="0"):
+        main()
     printed = capsys.readouterr().out
     scoreboard = judge_board(board, tmp_path / "j", name=EXAMPLE)
     assert printed.startswith("\n".join(figure_lines(scoreboard)))
