@@ -83,14 +83,14 @@ def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, An
     task = HologramTask(settings, printer, inputs={"target": load_target("text", size_px).pixels})
     parameters = make_parametrisation(settings.layout, settings.search).to(device)
     parameters.start_random(0)
-    level = parameters.sample(1.0, True, 0).detach().requires_grad_()
+    level = parameters.sample(hard=True).detach().requires_grad_()
 
     def predict() -> None:
         torch.autograd.grad(printer(level).sum(), level)
 
     def iterate() -> None:
         parameters.zero_grad(set_to_none=True)
-        task.objective(parameters.sample(1.0, True, 0))[0].backward()
+        task.objective(parameters.sample(hard=True))[0].backward()
 
     return {
         "model": name,
