@@ -38,8 +38,8 @@ LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "twist": (1, 2, 4),
     "bow": (1, 2, 3, 4, 5),
 }
-_HIGHEST, _LATERAL = 7, 3
-# What is tried, the most likely first. A background of degree 7 turns over 14 µm in a field of 54 µm.
+_HIGHEST, _LATERAL = 11, 3
+# What is tried, the most likely first. A background of degree 11 turns over 9 µm in a field of 54 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -55,7 +55,7 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
 # Scans' worth of evidence for no difference between groups: the spread within groups over that between them.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part stays if the held-out squared error falls by more than so many standard errors, and by such a share.
-_LEAST_Z, _LEAST_SHARE = 0.5, 0.01
+_LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
 # Displacements are found by their derivative; the second time around it is taken at the displaced print.
 _ROUNDS = 2
