@@ -58,7 +58,7 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
 
     apart = {}
     for weight in (0.0, 20.0):
-        ensemble = small_settings.ensemble.model_copy(update={"weight": weight, "risk": "mean"})
+        ensemble = small_settings.ensemble.model_copy(update={"weight": weight})
         settings = small_settings.model_copy(update={"ensemble": ensemble})
         main, other = models()
         design = design_hologram(
