@@ -141,7 +141,7 @@ def test_the_drawing_reads_no_catalogue():
     """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
     rooms = ("litho_models.effects", "litho_models.loop")
     code = (
-        "import sys, litho_models.boards.draws, benchmarks.blind_trials.planting\n"
+        "import sys, litho_models.boards.draws, litho_models.boards.planting\n"
         f"print(*(m for m in sys.modules if m.startswith({rooms})))"
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
