@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.fit import common_geometry, run_key
-from litho_models.fitting.pixel_weights import pixel_weights
+from litho_models.fitting.least_squares import Linearised
+from litho_models.fitting.pixel_weights import Weighted, pixel_weights
 from litho_models.models import build_model
 from tests.litho_models.prints import make_scans
 
@@ -50,6 +52,24 @@ def test_a_fit_believes_pixels_by_their_uncertainty(scans, name):
     alone = _vector(name, _half(scans))
     # Weights are 1 / 50 for the spoilt half: what remains of its pull is that share, with room for the noise.
     assert np.abs(weighted - alone).max() < 0.1 * np.abs(uniform - alone).max()
+
+
+@pytest.mark.parametrize("loss", ["absolute", "squares"])
+def test_what_a_scan_may_add_is_weighted_as_its_residual_is(loss):
+    random = np.random.default_rng(0)
+    part = Linearised(random.normal(size=50), random.normal(size=(3, 50)), random.normal(size=(2, 50)))
+    weight = random.uniform(0.1, 2.0, 50)
+    problem = SimpleNamespace(linearise=lambda vector: [part], residuals=lambda vector: [part.residual])
+    weighted = Weighted(problem, [weight], loss)
+    (found,) = weighted.linearise(np.zeros(3))
+    np.testing.assert_array_equal(weighted.residuals(np.zeros(3)), [weight * part.residual])
+    np.testing.assert_array_equal(found.residual, weight * part.residual)
+    np.testing.assert_array_equal(found.jacobian, weight * part.jacobian)
+    # The same span: with both together there is no third direction, and each has two.
+    basis = weight * part.basis
+    assert np.linalg.matrix_rank(np.concatenate([found.basis, basis])) == len(found.basis) == 2
+    if loss == "squares":
+        np.testing.assert_allclose(found.basis @ found.basis.T, np.eye(2), atol=1e-12)
 
 
 def test_weights_have_mean_one_and_are_zero_where_nothing_is_measured(scans):
