@@ -49,9 +49,8 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     """Image of a mask (b, 1, y, x), 1 where all is open; cut by the reach of the kernels."""
     reach = kernel_reach_px(optics, pitch_um)
     ny, nx = transmission.shape[-2:]
-    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
-    if transmission.dtype == torch.float64:
-        spectra = spectra.to(torch.complex128)
+    kind = torch.complex128 if transmission.dtype == torch.float64 else torch.complex64
+    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device, kind)
     return imaged(transmission, spectra)[..., reach : ny - reach, reach : nx - reach]
 
 
@@ -101,7 +100,7 @@ def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
     return inside * np.exp(2j * math.pi * optics.defocus_um / optics.wavelength_um * along)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
     """Transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
@@ -112,4 +111,4 @@ def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) ->
     # A mask that is open everywhere is 1, with as many kernels as there are.
     spectra = np.fft.fft2(placed)
     spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
-    return torch.from_numpy(spectra.astype(np.complex64))
+    return torch.from_numpy(spectra)
