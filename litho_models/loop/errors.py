@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -197,3 +197,23 @@ class HeldOut:
 
 def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, bool]) -> Fit:
     return fit_with_measurement(*job[1:])
+
+
+def errors_of_others(
+    found: Iterable[tuple[HeldOut, Sequence[PrintedScan]]],
+    scans: Sequence[PrintedScan],
+    held_out: str,
+    seed: int,
+) -> list[ErrorRow]:
+    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
+    maps: dict[Stage, dict[str, np.ndarray]] = {}
+    numbers: dict[Stage, tuple[int, int]] = {}
+    for models, out in found:
+        for stage, count, own in models.of_others(out):
+            maps.setdefault(stage, {}).update(zip([scan.id for scan in out], own, strict=True))
+            numbers[stage] = max(count, numbers.get(stage, count))
+    rows = []
+    for stage, known in maps.items():
+        terms = {"model": stage, "measurement": "shared", "held_out": held_out}
+        rows += error_rows(scans, [known[scan.id] for scan in scans], numbers[stage], seed, **terms)
+    return rows

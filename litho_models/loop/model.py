@@ -231,18 +231,13 @@ class Twin:
         """Fitted values of base and effects that stand on a bound of their range, and that bound."""
         placed = self.placed().base
         found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
-        for slot, bound in self._on_bounds():
-            found[f"{slot.effect}: {slot.parameter}"] = bound
-        return found
+        return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
         """Amplitudes of an effect that some group has at a limit of their range other than the null."""
-        found = [
-            slot.parameter
-            for slot, bound in self._on_bounds()
-            if slot.effect == name and slot.facts.kind == "amplitude" and bound != slot.facts.null
-        ]
-        return [*dict.fromkeys(found)]
+        own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
+        beyond = (slot for slot, at in own if slot.facts.kind == "amplitude" and at != slot.facts.null)
+        return [*dict.fromkeys(slot.parameter for slot in beyond)]
 
     def _on_bounds(self) -> list[tuple[Slot, float]]:
         return [
