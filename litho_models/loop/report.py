@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.reports.page import Page, sentences
-from litho_data.reports.pictures import new_figure
+from litho_data.reports.pictures import colour_bar_png, coloured_png, new_figure, thumbnail
 from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.heading("What new prints decide")
         page.points([said("decision", one) for one in result.decisions])
     page.heading("Where the residual lies")
-    page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
+    _residuals(page, maps)
     page.table(
         result.explained,
         "What a ridge over features of layout and place still explains, out of fold.",
@@ -106,21 +106,16 @@ def _bars(result: CloseLoop) -> Figure:
     return figure
 
 
-def _residuals(maps: Maps) -> Figure:
-    """Maps of the scans with the largest, a middling and the smallest error of the base."""
-    size = [float(np.nanmean(before**2)) for _, before, _ in maps]
-    order = np.argsort(size)[::-1][[0, (len(maps) - 1) // 2, -1]].tolist()
-    shown = [maps[at] for at in dict.fromkeys(order)]
-    limit = 2.5 * float(np.sqrt(np.mean(size)))
-    figure = new_figure(4 * len(shown) + 0.8, 8)
-    axes = figure.subplots(2, len(shown), squeeze=False)
-    for column, (name, *pair) in zip(axes.T, shown, strict=True):
-        for panel, when, own in zip(column, ("before", "after"), pair, strict=True):
-            panel.imshow(own, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-            panel.set_title(f"{name} {when}: {np.nanmean(np.abs(own)):.1f} nm", fontsize=10)
-            panel.set_axis_off()
-    figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - expected (nm)", shrink=0.6)
-    return figure
+def _residuals(page: Page, maps: Maps) -> None:
+    limit_nm = 2.5 * float(np.sqrt(np.mean([np.nanmean(before**2) for _, before, _ in maps])))
+    bar = colour_bar_png("RdBu_r")
+    titles = [(f"{when}, {-limit_nm:.0f} … {limit_nm:.0f} nm", bar) for when in ("before", "after")]
+    rows = []
+    for name, *pair in maps:
+        errors = " → ".join(f"{np.nanmean(np.abs(own)):.1f}" for own in pair)
+        shown = [coloured_png(thumbnail(own), "RdBu_r", -limit_nm, limit_nm) for own in pair]
+        rows.append((f"{name}: {errors} nm", shown))
+    page.gallery(titles, rows, "Measured minus expected, and the mean absolute error of each map.")
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
