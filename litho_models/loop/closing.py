@@ -26,7 +26,8 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans, prepared_among
 from litho_models.loop.search import Cause, Found, describe, search, untestable
 from litho_models.loop.trials import Secants
-from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.measurement_fit import learn_measurement
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
-from litho_models.scan_terms import measurement
+from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
@@ -449,7 +449,7 @@ def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "TABLES", {})
     # That scans share more has its own tests.
-    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))
+    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
 
 
 @pytest.mark.slow
