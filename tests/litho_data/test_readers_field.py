@@ -137,8 +137,8 @@ def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pyt
         (_crash, "crashed"),
         (_greedy, "memory"),
     ):
-        # Seconds to start on a busy machine; only the parser that sleeps has to be waited for.
-        waiting = 10 if parser is _asleep else 500
+        # Minutes to start on a busy machine; only the parser that sleeps has to be waited for.
+        waiting = 2 if parser is _asleep else 500
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", waiting)
         with pytest.raises(InputError, match=message):
             confined(parser, ())(path)
