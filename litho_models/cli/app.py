@@ -9,11 +9,20 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.commands.app import DaskOption, WorkersOption, new_app, run_app, with_further_options
+from litho_data.commands.app import (
+    DaskOption,
+    WorkersOption,
+    argument,
+    new_app,
+    option,
+    run_app,
+    with_further_options,
+)
 from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
+from litho_models.cli.board import board
 from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
@@ -24,58 +33,44 @@ app.command()(noise)
 app.command()(check)
 zoo = typer.Typer(help="The models that come with the package: list, or show NAME.", no_args_is_help=True)
 app.add_typer(zoo, name="zoo")
+app.add_typer(board, name="board")
 
-StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
-Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
+ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME")]
+StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]
+Out = Annotated[Path, option("folder of the result; one that holds anything else is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
-    typer.Option(
-        help="terms fitted to each scan for its datum-free error; offset by default, for films none"
-    ),
+    option("terms fitted to each scan for its datum-free error; offset by default, for films none"),
 ]
 _BACKGROUND_HELP = (
     "training: add the smooth background that the training scans share to predictions of measured maps"
 )
-BackgroundOption = Annotated[Literal["training", "none"] | None, typer.Option(help=_BACKGROUND_HELP)]
+BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    typer.Option(help=f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
+    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
 ]
 NoiseOption = Annotated[
     Path | None,
-    typer.Option(
-        help="noise.json of `litho-models noise` on this dataset, to show its floor beside the errors"
-    ),
+    option("noise.json of `litho-models noise` on this dataset, to show its floor beside the errors"),
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    typer.Option(
-        help="fast: one-cycle, with the terms of each scan fitted jointly; paper: 4,000 epochs of Adam"
-    ),
+    option("fast: one-cycle, with the terms of each scan fitted jointly; paper: 4,000 epochs of Adam"),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
-    typer.Option(help="ours, as printed in the paper, or as in the authors' code"),
+    option("ours, as printed in the paper, or as in the authors' code"),
 ]
-Steps = Annotated[int | None, typer.Option(min=1, help="optimiser steps; the recipe's by default")]
+Steps = Annotated[int | None, option("optimiser steps; the recipe's by default", min=1)]
 PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
-    typer.Option(help="of the products within networks in training; the recipe's by default", hidden=True),
+    option("of the products within networks in training; the recipe's by default", hidden=True),
 ]
-WeightsOption = Annotated[
-    Literal["uniform", "sigma"],
-    typer.Option(
-        help="what pixels count for in fits: alike, or by 1 / σ of the height; errors count all alike",
-        hidden=True,
-    ),
-]
-Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
+Seed = Annotated[int, option("seed of weights, crops and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        help="FIELD=VALUE of the training, such as learning_rate=0.001; repeatable",
-    ),
+    option("FIELD=VALUE of the training, such as learning_rate=0.001; repeatable", "--set"),
 ]
 
 
@@ -85,8 +80,8 @@ def train(
     store: StorePath,
     model: Annotated[
         str,
-        typer.Option(
-            help="identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
+        option(
+            "identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
             "e-beam, pbl or fno"
         ),
     ],
@@ -95,12 +90,11 @@ def train(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
-    weights: WeightsOption = "uniform",
     seed: Seed = 0,
     set_: SetOption = None,
     use_lock_box: Annotated[
         bool,
-        typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
+        option("train on the locked scans too; nothing is left to judge by", "--use-lock-box"),
     ] = False,
 ) -> None:
     """Train a model on all scans but the locked ones; resumable.
@@ -109,9 +103,7 @@ def train(
     """
     from litho_models.frozen.readme import bounds_text
 
-    settings = _training(
-        set_, recipe=recipe, variant=variant, seed=seed, weights=weights, steps=steps, precision=precision
-    )
+    settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
     run = litho_models.train(
         store, model, out, recipe=settings.pop("recipe"), settings=settings, use_lock_box=use_lock_box
     )
@@ -123,20 +115,20 @@ def train(
 @app.command()
 @with_paper_copies
 def evaluate(
-    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
+    model: ModelName,
     store: StorePath,
     out: Out,
     policy: PolicyOption = None,
     background: BackgroundOption = None,
     noise: NoiseOption = None,
     extrapolate: Annotated[
-        bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
+        bool, option("accept layouts beyond the calibrated range", "--extrapolate")
     ] = False,
     open_lock_box: Annotated[
         bool,
-        typer.Option(
+        option(
+            "score the locked scans of the dataset that the model was trained on too; once per release",
             "--open-lock-box",
-            help="score the locked scans of the dataset that the model was trained on too; once per release",
         ),
     ] = False,
 ) -> None:
@@ -157,16 +149,9 @@ def evaluate(
         extrapolate=extrapolate,
         open_lock_box=open_lock_box,
     )
-    scores = result.scores
     typer.echo(lock_box_text(result.split))
-    if scores.seen_by == "sem":
-        typer.echo(evaluation_verdict(result))
-        return
-    typer.echo(
-        f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
-        f"mae_abs {scores.mae_abs_nm:.2f} nm; "
-        f"report {out / 'report.html'}"
-    )
+    typer.echo(evaluation_verdict(result))
+    typer.echo(f"report {out / 'report.html'}")
 
 
 @app.command()
@@ -176,29 +161,28 @@ def benchmark(
     store: StorePath,
     out: Out,
     split: Annotated[
-        Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
+        Literal["grouped", "paper", "leave-one-print-out"], option("what is held out")
     ] = "grouped",
-    models: Annotated[str | None, typer.Option(help="names, comma-separated; all by default")] = None,
+    models: Annotated[str | None, option("names, comma-separated; all by default")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
-    weights: WeightsOption = "uniform",
-    folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
+    folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
-        typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default", hidden=True),
+        option("only so many of the folds, to compare seeds; all by default", min=1, hidden=True),
     ] = None,
     policy: PolicyOption = None,
     background: SharedOption = None,
     noise: NoiseOption = None,
     open_lock_box: Annotated[
-        bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
+        bool, option("also score the locked scans; once per release", "--open-lock-box")
     ] = False,
     seed: Seed = 0,
     training_seed: Annotated[
         int | None,
-        typer.Option(min=0, help="of weights and crops alone, same split; --seed by default", hidden=True),
+        option("of weights and crops alone, same split; --seed by default", min=0, hidden=True),
     ] = None,
     set_: SetOption = None,
     workers: WorkersOption = 1,
@@ -213,7 +197,7 @@ def benchmark(
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
     settings = _training(
-        set_, recipe=recipe, variant=variant, weights=weights, steps=steps, precision=precision,
+        set_, recipe=recipe, variant=variant, steps=steps, precision=precision,
         seed=training_seed,
     )  # fmt: skip
     result = litho_models.benchmark(
@@ -242,11 +226,11 @@ def benchmark(
 
 @app.command()
 def predict(
-    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
-    layout: Annotated[Path, typer.Argument(help="TIFF, PNG, BMP or NPY of levels, or any exported file")],
-    out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
+    model: ModelName,
+    layout: Annotated[Path, argument("TIFF, PNG, BMP or NPY of levels, or any exported file")],
+    out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     extrapolate: Annotated[
-        bool, typer.Option("--extrapolate", help="accept levels beyond the calibrated range")
+        bool, option("accept levels beyond the calibrated range", "--extrapolate")
     ] = False,
 ) -> None:
     """Predict the printed height of a layout that is sampled at the pitch of the model.
@@ -263,9 +247,9 @@ def predict(
 
 @app.command()
 def export(
-    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
-    out: Annotated[Path, typer.Option(help="file to write: .pt2 (torch.export) or .onnx (extra onnx)")],
-    size_px: Annotated[int, typer.Option(min=1, help="side of the layouts that the program takes")] = 512,
+    model: ModelName,
+    out: Annotated[Path, option("file to write: .pt2 (torch.export) or .onnx (extra onnx)")],
+    size_px: Annotated[int, option("side of the layouts that the program takes", min=1)] = 512,
 ) -> None:
     """Write a frozen model as a program for layouts of one size, which runs without this package.
 
@@ -298,7 +282,7 @@ def list_zoo() -> None:
 
 
 @zoo.command("show")
-def show_zoo(name: Annotated[str, typer.Argument(help="name of a model of the zoo")]) -> None:
+def show_zoo(name: Annotated[str, argument("name of a model of the zoo")]) -> None:
     """Show the page of a model that comes with the package.
 
     Example: litho-models zoo show pbl
@@ -310,8 +294,8 @@ def show_zoo(name: Annotated[str, typer.Argument(help="name of a model of the zo
 
 @app.command()
 def compare(
-    first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
-    second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
+    first: Annotated[Path, argument("benchmark.json or evaluation.json")],
+    second: Annotated[Path, argument("another one, of the same protocol")],
 ) -> None:
     """Difference of two results, paired by scan; refuses different data, folds or per-scan terms.
 
@@ -323,28 +307,21 @@ def compare(
 @app.command()
 def freeze(
     run: Annotated[
-        str, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
+        str, argument("folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
     ],
     out: Out,
     attribute: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "whose the effects of undetermined role are, of all of them or of one; repeatable",
             metavar="[EFFECT=]microscope|printer",
-            help="whose the effects of undetermined role are, of all of them or of one; repeatable",
         ),
     ] = None,
-    declare_process: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Write the process model only: weights, card and a page for people.
 
     Example: litho-models freeze run --out printer
     """
-    if declare_process:
-        raise InputError(
-            "option",
-            got=f"--declare-process {declare_process[0]}",
-            wanted=f"--attribute {declare_process[0]}=printer",
-        )
     card = litho_models.freeze(run, out, _attribution(attribute or []))
     typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")
 

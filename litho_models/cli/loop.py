@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import litho_models
-from litho_data.commands.app import DaskOption, WorkersOption
+from litho_data.commands.app import DaskOption, WorkersOption, argument, option
 from litho_data.reports.paper import with_paper_copies
 
 
@@ -16,42 +16,34 @@ from litho_data.reports.paper import with_paper_copies
 def close_loop(
     stores: Annotated[
         list[Path],
-        typer.Argument(
-            help="dataset store made by litho-data build; further stores, later prints of the same printer, "
+        argument(
+            "dataset store made by litho-data build; further stores, later prints of the same printer, "
             "decide what the first leaves open"
         ),
     ],
-    out: Annotated[
-        Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
-    ],
+    out: Annotated[Path, option("folder for result, report, tables and the corrected model")],
     base: Annotated[
         str,
-        typer.Option(
-            "--base", help="model to correct: its name, a frozen one (a folder, zoo:NAME), or auto: the best"
-        ),
+        option("model to correct: its name, a frozen one (a folder, zoo:NAME), or auto: the best"),
     ] = "auto",
-    folds: Annotated[int, typer.Option("--folds", min=2, help="by scan")] = 5,
+    folds: Annotated[int, option("by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
-        typer.Option(
-            "--nested", help="also choose all anew without each fold, or print, and judge it there; slow"
-        ),
+        option("also choose all anew without each fold, or print, and judge it there; slow"),
     ] = None,
     inject: Annotated[
         list[str] | None,
-        typer.Option("--inject", help="plant NAME=AMOUNT (its own unit) in copies of the data: is it found?"),
+        option("plant NAME=AMOUNT (its own unit) in copies of the data: is it found?"),
     ] = None,
     open_lock_box: Annotated[
-        bool, typer.Option("--open-lock-box", help="also score the locked scans; do this once")
+        bool, option("also score the locked scans; do this once", "--open-lock-box")
     ] = False,
-    steps: Annotated[
-        int | None, typer.Option("--steps", min=1, help="optimiser steps of a network as base, per fold")
-    ] = None,
+    steps: Annotated[int | None, option("optimiser steps of a network as base, per fold", min=1)] = None,
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", help="folder of a network's trainings per fold; beside --out by default"),
+        option("folder of a network's trainings per fold; beside --out by default"),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
+    seed: Annotated[int, option("folds and bootstrap, not the lock box", min=0)] = 0,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
@@ -59,7 +51,7 @@ def close_loop(
 
     Example: litho-models close-loop prints.zarr --out loop
     """
-    from litho_models.loop.report import decision_text, effect_text, verdict_text
+    from litho_models.loop.report import said
 
     result = litho_models.close_loop(
         stores[0],
@@ -77,11 +69,11 @@ def close_loop(
         dask=dask,
         report=lambda message: typer.echo(message, err=True),
     )
-    typer.echo(verdict_text(result))
+    typer.echo(said("verdict", result))
     for one in result.effects:
-        typer.echo(f"  {effect_text(one)}")
+        typer.echo("  " + said("effect", one))
     for decision in result.decisions:
-        typer.echo(f"  {decision_text(decision)}")
+        typer.echo("  " + said("decision", decision))
     typer.echo(f"report: {out / 'report.html'}")
 
 
@@ -90,33 +82,27 @@ EXIT_ALARM = 3
 
 
 def check(
-    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
-    store: Annotated[Path, typer.Argument(help="dataset store of the new prints")],
-    out: Annotated[Path, typer.Option("--out", help="folder for check.json, report and tables")],
+    model: Annotated[str, argument("folder of a frozen model, or zoo:NAME")],
+    store: Annotated[Path, argument("dataset store of the new prints")],
+    out: Annotated[Path, option("folder for check.json, report and tables")],
     reference: Annotated[
         Path | None,
-        typer.Option(help="store of unchanged prints; the prints in the model's card by default"),
+        option("store of unchanged prints; the prints in the model's card by default"),
     ] = None,
     new: Annotated[
         list[str] | None,
-        typer.Option(help="a print of STORE that is new, the others are the reference; repeatable"),
+        option("a print of STORE that is new, the others are the reference; repeatable"),
     ] = None,
     residuals: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="folder of `benchmark` on the reference prints: errors of prints that no fit had seen"
-        ),
+        option("folder of `benchmark` on the reference prints: errors of prints that no fit had seen"),
     ] = None,
-    false_alarms: Annotated[
-        float, typer.Option(help="share of unchanged data sets that raise an alarm")
-    ] = 0.005,
+    false_alarms: Annotated[float, option("share of unchanged data sets that raise an alarm")] = 0.005,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="largest drift of a figure, 0.05 is 5 %; by default three times its spread"),
+        option("largest drift of a figure, 0.05 is 5 %; by default three times its spread"),
     ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help=f"end with exit code {EXIT_ALARM} on an alarm")
-    ] = False,
+    strict: Annotated[bool, option(f"end with exit code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
     """Tell whether new prints differ from those a model was made of, and when to measure again.
 
@@ -142,18 +128,16 @@ def check(
 
 
 def next_print(
-    loop: Annotated[Path, typer.Argument(help="folder of litho-models close-loop")],
-    out: Annotated[
-        Path, typer.Option("--out", help="folder of the plan: card, layouts, table of scans, sheets, report")
-    ],
-    prints: Annotated[int, typer.Option("--prints", min=1, help="prints to plan, references apart")] = 4,
-    field_um: Annotated[float, typer.Option("--field-um", min=1.0, help="side of a print, µm")] = 51.2,
+    loop: Annotated[Path, argument("folder of litho-models close-loop")],
+    out: Annotated[Path, option("folder of the plan: card, layouts, table of scans, sheets, report")],
+    prints: Annotated[int, option("prints to plan, references apart", min=1)] = 4,
+    field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],
-        typer.Option("--layouts", help="random: a control, the same scans of layouts with nothing optimised"),
+        option("random: a control, the same scans of layouts with nothing optimised"),
     ] = "optimised",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="of the random layouts to start from")] = 0,
-    steps: Annotated[int, typer.Option("--steps", min=0, help="of the ascent of each tile")] = 40,
+    seed: Annotated[int, option("of the random layouts to start from", min=0)] = 0,
+    steps: Annotated[int, option("of the ascent of each tile", min=0)] = 40,
 ) -> None:
     """Plan the prints and scans that decide what a closed loop left open; resumes after a kill.
 

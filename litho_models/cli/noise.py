@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import litho_models
+from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 
 # What only single files need, and what only a store has.
@@ -17,32 +18,28 @@ OF_A_STORE = ("residuals", "model", "seed")
 
 def noise(
     context: typer.Context,
-    out: Annotated[Path, typer.Option("--out", help="folder for noise.json, report and tables")],
+    out: Annotated[Path, option("folder for noise.json, report and tables")],
     store: Annotated[
-        Path | None, typer.Argument(help="dataset store; its scans of use substrate, flat and steps are used")
+        Path | None, argument("dataset store; its scans of use substrate, flat and steps are used")
     ] = None,
-    substrate: Annotated[
-        Path | None, typer.Option(help="scan of the bare substrate, without a store")
-    ] = None,
-    flat: Annotated[Path | None, typer.Option(help="scan of a flat print, without a store")] = None,
-    steps: Annotated[Path | None, typer.Option(help="scan of a step print, without a store")] = None,
-    unit: Annotated[str | None, typer.Option(help="unit of these scans where the files state none")] = None,
+    substrate: Annotated[Path | None, option("scan of the bare substrate, without a store")] = None,
+    flat: Annotated[Path | None, option("scan of a flat print, without a store")] = None,
+    steps: Annotated[Path | None, option("scan of a step print, without a store")] = None,
+    unit: Annotated[str | None, option("unit of these scans where the files state none")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
-        typer.Option("--size-um", metavar="Y X", help="their size in µm where the files state none"),
+        option("their size in µm where the files state none", metavar="Y X"),
     ] = None,
-    level_height_um: Annotated[float, typer.Option(help="nominal step of the step print, µm")] = 0.1,
+    level_height_um: Annotated[float, option("nominal step of the step print, µm")] = 0.1,
     residuals: Annotated[
         list[str] | None,
-        typer.Option(
-            help="folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
+        option(
+            "folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
             "zoo:NAME), for σ(x) alone; several are an ensemble; repeatable"
         ),
     ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="which model of the benchmark; its best one by default")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
+    model: Annotated[str | None, option("which model of the benchmark; its best one by default")] = None,
+    seed: Annotated[int, option("seed of the pixels drawn", min=0)] = 0,
 ) -> None:
     """Roughness, dose matrix, noise budget, σ(x) and its calibration; lengths in µm, noise in nm.
 

@@ -7,7 +7,6 @@ from typing import Any, Literal, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.foundation.errors import require_known
-from litho_models.fitting.pixel_weights import Weights
 from litho_models.scan_terms import Policy
 from litho_models.simulator import Simulator, Variant, is_small
 
@@ -19,7 +18,7 @@ FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # no scan is spent on choosing between its rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # What a fit by least squares depends on.
-LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain", "weights"}
+LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
 # Nothing real needs more of anything, and beyond it sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
@@ -49,20 +48,14 @@ class TrainingConfig(BaseModel):
         128, ge=8, le=_MOST, description="scored width and height of a crop; a model with tiles takes its own"
     )
     crops: Literal["random", "quadrants"] = "random"
-    flips: bool = False
     optimiser: Literal["adamw", "adam"] = "adamw"
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     learning_rate: float = Field(2e-3, gt=0, le=_MOST)
     weight_decay: float = Field(1e-3, ge=0, le=_MOST)
-    loss: Literal["l1", "smooth-l1"] = "l1"
-    smooth_l1_beta_um: float = Field(
-        0.1, gt=0, le=_MOST, description="width of the quadratic part of smooth-l1, µm"
-    )
     nuisance: Policy = "full+rows"
     free_gain: bool = Field(
         False, description="a gain per scan among the nuisances, where the policy has one"
     )
-    weights: Weights = Field("uniform", description="what pixels count for: alike, or by 1 / σ of the height")
     validation_scans: int = Field(
         2, ge=0, le=_MOST, description="training scans that only choose the checkpoint"
     )

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
 # What a network remembers of a crop for its gradient is hundreds of bytes per pixel.
@@ -59,8 +60,7 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
         scan = int(random.integers(len(shapes)))
         size = min(config.crop_px, *shapes[scan])
         y, x = (int(random.integers(length - size + 1)) for length in shapes[scan])
-        flip = (bool(random.integers(2)), bool(random.integers(2))) if config.flips else (False, False)
-        windows.append(Window(scan, y, x, size, flip))
+        windows.append(Window(scan, y, x, size))
     return windows
 
 
@@ -97,3 +97,11 @@ def _from_permuted_quadrants(
         order = np.random.default_rng([config.seed, epoch]).permutation(len(every))
         windows.append(every[order[position]])
     return windows
+
+
+def grid_pixels(scan: PrintedScan, count: int) -> np.ndarray:
+    """Flat indices of the measured pixels on a square grid of about ``count`` pixels."""
+    step = max(1, round((scan.usable.size / count) ** 0.5))
+    grid = np.zeros_like(scan.usable)
+    grid[::step, ::step] = True
+    return np.flatnonzero(scan.usable & grid)

@@ -15,7 +15,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import TrainingConfig
-from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights
+from litho_models.fitting.crops import grid_pixels
 from litho_models.fitting.stochastic import learning_rate, validation_error
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.pbl import Pbl
@@ -30,14 +30,11 @@ EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """Of one scan: features (n, all), what is measured beyond the chain (n,) µm, its own terms (m, n), and
-    what each pixel counts for (n,).
-    """
+    """Of one scan: features (n, all), what is measured beyond the chain (n,) µm, and its own terms (m, n)."""
 
     features: Tensor
     rest_um: FloatMap
     terms: FloatMap
-    weight: Tensor
 
 
 def fit_feature_networks(
@@ -48,15 +45,13 @@ def fit_feature_networks(
     Offsets of lines are left out of the terms of the scans, as they average out.
 
     Returns:
-        the round, its error weighted and with the terms of the scans taken out; ``validation`` scans change
+        the round, its error with the terms of the scans taken out; ``validation`` scans change
         nothing.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance, config.free_gain)
     count = FITTED_PX // len(scans)
-    parts = [
-        _pixels(model, scan, terms, count, config.weights) for scan in progress(scans, "features of pixels")
-    ]
+    parts = [_pixels(model, scan, terms, count) for scan in progress(scans, "features of pixels")]
     sizes = [network.feature_count for network in model.feature_networks]
     centre = torch.stack([part.features.mean(dim=0) for part in parts]).mean(dim=0)
     spread = torch.stack([part.features.var(dim=0) for part in parts]).mean(dim=0).sqrt()
@@ -71,7 +66,6 @@ def fit_feature_networks(
         return torch.stack([network.at_pixels(own.T) for network, own in both]).sum(dim=0)
 
     features = torch.cat([part.features for part in parts])
-    weight = torch.cat([part.weight for part in parts])
     steps = EPOCHS * -(-len(features) // BATCH_PX)
     schedule = config.model_copy(
         update={"steps": steps, "learning_rate": LEARNING_RATE, "schedule": "one-cycle"}
@@ -88,7 +82,7 @@ def fit_feature_networks(
         for batch in torch.randperm(len(features), generator=random).split(BATCH_PX):
             for group in optimiser.param_groups:
                 group["lr"] = learning_rate(schedule, step)
-            loss = (weight[batch] * (heights(features[batch]) - target[batch]).abs()).mean()
+            loss = (heights(features[batch]) - target[batch]).abs().mean()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -112,7 +106,7 @@ def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinn
     return torch.from_numpy(np.concatenate(freed).astype(np.float32))
 
 
-def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int, weights: Weights) -> _Pixels:
+def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int) -> _Pixels:
     at = grid_pixels(scan, count)
     chosen = torch.from_numpy(at)
     with torch.no_grad():
@@ -125,5 +119,4 @@ def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int, weights: We
         ]
     rest = scan.height_um.reshape(-1)[at].astype(np.float64) - printed.flatten()[chosen].double().numpy()
     maps = term_maps(TermPixels(scan.layout_um, at=at), terms)
-    weight = torch.from_numpy(pixel_weights(scan, weights).reshape(-1)[at])
-    return _Pixels(torch.stack(seen, dim=1), rest, maps, weight)
+    return _Pixels(torch.stack(seen, dim=1), rest, maps)

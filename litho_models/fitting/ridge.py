@@ -9,8 +9,8 @@ import torch
 
 from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
+from litho_models.fitting.crops import grid_pixels
 from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
-from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
@@ -31,35 +31,24 @@ PASSES = 2
 _TERM_WEIGHT = 1e-3
 
 
-def fit_ridge(
-    model: Features,
-    scans: Sequence[PrintedScan],
-    policy: Policy,
-    free_gain: bool = False,
-    weights: Weights = "uniform",
-) -> list[float]:
+def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False) -> None:
     """Fit the weights of ``model`` in place to the mean absolute error.
 
     Args:
         model: the model; ``scans``: what it is fitted to.
         policy: what each scan may add by itself; offsets of lines are left out, as they average out.
-        weights: what pixels count for.
-
-    Returns:
-        mean absolute residual before the last pass, µm, the terms of the scans taken out.
     """
     terms = smooth_training_terms(policy, free_gain)
     if isinstance(model, RandomFeatures):
         _standardise(model, scans)
     solved: FloatMap | None = None
-    losses: list[float] = []
     kept: dict[int, tuple[FloatMap, FloatMap, FloatMap]] = {}
     keeps = 8 * FITTED_PX * model.parameter_count * len(scans) <= KEPT_BYTES
     for _ in range(PASSES):
         size = model.parameter_count
-        matrix, right, errors = np.zeros((size, size)), np.zeros(size), []
+        matrix, right = np.zeros((size, size)), np.zeros(size)
         for number, scan in enumerate(progress(scans, f"fitting {model.name}")):
-            rows = kept.get(number) or _rows(model, scan, terms, weights)
+            rows = kept.get(number) or _rows(model, scan, terms)
             if keeps:
                 kept[number] = rows
             design, height, basis = rows
@@ -67,17 +56,14 @@ def fit_ridge(
             if solved is not None:
                 rest = height - solved @ design
                 rest -= least_squares(basis, rest) @ basis if len(basis) else 0.0
-                errors.append(np.abs(rest).mean())
                 certainty = 1 / np.sqrt(rest**2 + ABSOLUTE_WIDTH_UM**2)
             root = np.sqrt(certainty / certainty.sum())
             own = Linearised(height * root, design * root, orthonormal((basis * root).T).T)
             normal, moment, _ = eliminated(own, _TERM_WEIGHT)
             matrix, right = matrix + normal, right + moment
         solved = _ridge(matrix, right)
-        losses += [float(np.mean(errors))] if errors else []
     with torch.no_grad():
         model.weights.copy_(torch.as_tensor(solved))
-    return losses
 
 
 def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
@@ -85,15 +71,11 @@ def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
     return np.linalg.solve(matrix / np.outer(size, size) + RIDGE * np.eye(len(size)), right / size) / size
 
 
-def _rows(
-    model: Features, scan: PrintedScan, terms: Terms, weights: Weights
-) -> tuple[FloatMap, FloatMap, FloatMap]:
-    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n), fitted pixels, weighted."""
+def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, FloatMap, FloatMap]:
+    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted pixels."""
     at = grid_pixels(scan, FITTED_PX)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
-    own = pixel_weights(scan, weights).reshape(-1)[at].astype(np.float64)
-    basis = term_maps(TermPixels(scan.layout_um, at=at), terms)
-    return own * feature_rows(model, scan, at), own * height, own * basis
+    return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from litho_data.commands.progress import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
-from litho_models.fitting.least_squares import Linearised, Problem, Room, Rules, fit_least_squares
-from litho_models.fitting.pixel_weights import Weighted, Weights, pixel_weights
+from litho_models.fitting.least_squares import Linearised, Room, Rules, fit_least_squares
 from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
@@ -30,11 +29,7 @@ RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=1
 
 
 def fit_small_model(
-    model: Simulator,
-    scans: Sequence[PrintedScan],
-    policy: Policy,
-    free_gain: bool = False,
-    weights: Weights = "uniform",
+    model: Simulator, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False
 ) -> list[float]:
     """Fit ``model`` in place to the mean absolute error, on every second row and column of a window per scan.
 
@@ -48,11 +43,8 @@ def fit_small_model(
         return []
     terms = smooth_training_terms(policy, free_gain)
     rules = replace(RULES, pinned=len(PINNED & terms))
-    problem: Problem = ModelProblem(model, scans, terms)
-    if weights != "uniform":
-        problem = Weighted(problem, window_weights(scans, weights), "absolute")
     shown = partial(progress, what=f"fitting {model.name}")
-    fitted = fit_least_squares(problem, _vector(model), rules, shown)
+    fitted = fit_least_squares(ModelProblem(model, scans, terms), _vector(model), rules, shown)
     _load(model, fitted.vector)
     return fitted.losses
 
@@ -82,12 +74,6 @@ class ModelProblem:
     def room(self, vector: np.ndarray) -> Room | None:
         """Within the ranges of the model; a linear one may go anywhere at once."""
         return None if self._model.is_linear else parameter_room(self._model, vector)
-
-
-def window_weights(scans: Sequence[PrintedScan], weights: Weights) -> list[np.ndarray]:
-    """Pixel weights (n,) at the pixels of each scan that a small model is fitted to."""
-    samples = (_Sample(scan, number) for number, scan in enumerate(scans))
-    return [sample.of(pixel_weights(scan, weights)) for sample, scan in zip(samples, scans, strict=True)]
 
 
 def parameter_room(model: nn.Module, vector: np.ndarray) -> Room:
@@ -144,10 +130,6 @@ class _Sample:
         if model.reach_px is None:
             return model(stack([self._layout_um], [self._window]))[0, 0]
         return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
-
-    def of(self, field_map: np.ndarray) -> np.ndarray:
-        """Values of a map of the whole scan at the used pixels, (n,) float64."""
-        return self._thinned(cut(field_map, self._window)).astype(np.float64)
 
     def residual(self, height_um: np.ndarray) -> np.ndarray:
         """Measured minus predicted at the used pixels, µm."""

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
@@ -27,7 +26,6 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
-from litho_models.fitting.pixel_weights import Weights, pixel_weights
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
@@ -75,7 +73,7 @@ def train_network(
         predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
         terms = training_terms(config.nuisance, config.free_gain)
         added = estimate_scan_terms(training, predictions, terms)
-        targets = _Targets(training, added, _overhang_px(model, training, config), config.weights)
+        targets = _Targets(training, added, _overhang_px(model, training, config))
         sums = []
         left = config.steps - first if first == begun else 0
         what = f"training {model.name} to step {config.steps}"
@@ -128,20 +126,13 @@ class _Targets:
     Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
     """
 
-    def __init__(
-        self,
-        scans: Sequence[PrintedScan],
-        added_um: Sequence[np.ndarray],
-        overhang_px: int,
-        weights: Weights,
-    ):
+    def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
         self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
         self.shapes = [layout.shape for layout in self.layouts_um]
-        usable = [scan.usable for scan in scans]
-        self.weights = [np.pad(pixel_weights(scan, weights), overhang_px) for scan in scans]
+        self.weights = [np.pad(scan.usable.astype(np.float32), overhang_px) for scan in scans]
         heights = [
-            np.where(mask, scan.height_um - added, 0).astype(np.float32)
-            for scan, added, mask in zip(scans, added_um, usable, strict=True)
+            np.where(scan.usable, scan.height_um - added, 0).astype(np.float32)
+            for scan, added in zip(scans, added_um, strict=True)
         ]
         self.heights_um = [np.pad(height, overhang_px) for height in heights]
 
@@ -194,7 +185,7 @@ def _step(
         share = len(some) * fabric.world_size / len(batch) if own else 0.0
         # Processes add their gradients once, with the last pass.
         with fabric.no_backward_sync(cast(Any, module), enabled=number < len(passes)):
-            loss, means = _losses(fabric, module, targets, some, config)
+            loss, means = _losses(fabric, module, targets, some)
             fabric.backward(share * loss)
         sums += share * means
     optimiser.step()
@@ -202,7 +193,7 @@ def _step(
 
 
 def _losses(
-    fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window], config: TrainingConfig
+    fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window]
 ) -> tuple[Tensor, Tensor]:
     """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
     prediction = module(_crops(fabric, targets.layouts_um, windows, module.margin_px))
@@ -213,8 +204,8 @@ def _losses(
         window = blending_window(module.tile, weight)
         weight = weight * (window / window.mean())
     # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
-    loss = (weight * _error(prediction, height, config)).mean()
-    return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
+    loss = (weight * (prediction - height).abs()).mean()
+    return loss, torch.stack([loss.detach(), weight.mean()])
 
 
 def _crops(
@@ -232,12 +223,6 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
         return 0
     shortest = min(length for scan in scans for length in scan.shape)
     return max(model.tile.overlap_px, -(-(model.tile.size_px - shortest) // 2))
-
-
-def _error(prediction: Tensor, height: Tensor, config: TrainingConfig) -> Tensor:
-    if config.loss == "l1":
-        return (prediction - height).abs()
-    return functional.smooth_l1_loss(prediction, height, reduction="none", beta=config.smooth_l1_beta_um)
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:

@@ -347,10 +347,9 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
         freeze(tmp_path / "left", tmp_path / "wrong", {"scan-axis": "printer"})
 
 
-def test_the_older_option_tells_the_new_one(folder, tmp_path):
+def test_a_wrong_attribution_is_refused_in_one_line(folder, tmp_path):
     command = ["freeze", str(folder), "--out", str(tmp_path / "out")]
     for words, said in (
-        (["--declare-process", "slope-thinning"], r"wanted --attribute slope-thinning=printer"),
         (["--attribute", "printer", "--attribute", "microscope"], r"EFFECT=microscope"),
         (["--attribute", "slope-thinning=printer"], r"an effect of undetermined role"),
     ):
