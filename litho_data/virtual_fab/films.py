@@ -24,7 +24,7 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
 # Pixels of the image to one of the layout, where an edge is sought, and of the micrograph.
-_FINER = 4
+_FINER, _AROUND = 4, 64
 _RESIST = 30.0
 _SOURCE_POINTS = 9
 _CARD = """name = "virtual-{process}"
@@ -136,8 +136,11 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
         turned = 1 / (1 + np.exp(-_RESIST * (field - threshold)))
         field, threshold = blur(turned, pitch, knobs.diffusion_um), 0.5
     fine = zoom(field, _FINER, order=3, mode="grid-wrap", grid_mode=True) > threshold
+    # Edges beyond the border count too: the layout goes on there.
+    fine = np.pad(fine, _AROUND, mode="wrap")
     inside, outside = distance_transform_edt(fine), distance_transform_edt(~fine)
-    return (np.where(fine, inside - 0.5, 0.5 - outside)) / _FINER + knobs.etch_bias_um / pitch
+    distance = np.where(fine, inside - 0.5, 0.5 - outside)[_AROUND:-_AROUND, _AROUND:-_AROUND]
+    return distance / _FINER + knobs.etch_bias_um / pitch
 
 
 def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
