@@ -135,7 +135,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
-    from litho_models.evaluation.tables import evaluation_verdict
+    from litho_models.evaluation.wording import evaluation_verdict
 
     result = litho_models.evaluate(
         model,

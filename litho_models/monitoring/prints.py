@@ -49,6 +49,7 @@ FIGURES = (
         0.2,
     ),
 )
+WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
