@@ -99,7 +99,7 @@ def train(
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
-    from litho_models.frozen.readme import bounds_text
+    from litho_models.frozen.card import bounds_text
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
     run = litho_models.train(

@@ -23,7 +23,6 @@ from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
 from litho_models.frozen import hub, zoo
 from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
-from litho_models.frozen.readme import model_readme
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
@@ -79,7 +78,7 @@ def save_frozen(
             raise InputError("model card", got=first_error(error), wanted=ModelCard.SCHEMA) from error
         _check_effects(card)
         card.write(temporary)
-        (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
+        (temporary / README_FILE).write_text(card.page, encoding="utf-8")
     return Path(folder)
 
 

@@ -14,7 +14,7 @@ from litho_models.monitoring.change_point import (
     noticeable_step,
 )
 from litho_models.monitoring.prints import FIGURES, Alarm, Figure, FigureCheck, print_values, spread_of
-from litho_models.scoring.metrics import ScanFigures
+from litho_models.scoring.printer_state import ScanFigures
 
 
 class Trend(NamedTuple):

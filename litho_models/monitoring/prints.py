@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.scoring.metrics import ScanFigures
+from litho_models.scoring.printer_state import ScanFigures
 
 _LEAST_GAIN = 0.01
 

@@ -11,7 +11,7 @@ from litho_data.reports.page import filled
 from litho_models.monitoring.change_point import SOON
 from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
-from litho_models.scoring.metrics import ScanFigures
+from litho_models.scoring.printer_state import ScanFigures
 
 # A layout this much flatter, higher or steeper than every one of the reference is of another kind.
 _OTHER_KIND = 1.1

@@ -29,7 +29,7 @@ from litho_models.noise.variance import (
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
 # Their roughness is correlated over ten pixels and more: more of them tell nothing new.
@@ -158,7 +158,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     for number in np.unique(fold):
         learned = np.flatnonzero(fold != number)
         residual = np.concatenate([samples[i] for i in learned])
-        flat = float(np.sqrt(np.mean(residual**2)))
+        flat = rms(residual)
         beta, tails = fit_spread(np.concatenate([designs[i] for i in learned]), residual)
         for i in np.flatnonzero(fold == number).tolist():
             constant[i] = Stated(np.full(scans[i].shape, flat), GAUSSIAN)
@@ -170,13 +170,13 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
             Stated(np.hypot(own.scale_nm, apart), own.tails)
             for own, apart in zip(by_covariates, found.disagreement_nm, strict=True)
         ]
-        epistemic = float(np.sqrt(np.mean([np.mean(d**2) for d in found.disagreement_nm])))
+        epistemic = rms([rms(apart) for apart in found.disagreement_nm])
     finite = np.concatenate([residual[np.isfinite(residual)] for residual in residuals])
     return SpreadAnalysis(
         model=found.model,
         members=found.members,
         held_out=found.held_out,
-        residual_rms_nm=float(np.sqrt(np.mean(finite**2))),
+        residual_rms_nm=rms(finite),
         residual_mae_nm=float(np.abs(finite).mean()),
         epistemic_rms_nm=epistemic,
         variance=variance_model(*fit_spread(np.concatenate(designs), np.concatenate(samples))),
@@ -204,7 +204,7 @@ def calibrate(
                 nll=float(-tails.log_likelihood(r, s).mean()),
                 crps_nm=float(tails.crps(r, s).mean()),
                 coverage=[float(tails.covered(r, s, level).mean()) for level in COVERAGE_LEVELS],
-                standardised_rms=float(np.sqrt(np.mean((r / s) ** 2)) / tails.sd),
+                standardised_rms=rms(r / s) / tails.sd,
                 factor_90=float(np.quantile(np.abs(r / s), 0.9) / tails.half_width(0.9)),
                 ence=normalised_calibration_error(r, tails.sd * s),
                 ause=sparsification_error(r, s),
@@ -254,8 +254,8 @@ def _bins(
             low=low,
             high=high,
             pixels=int(mine.sum()),
-            rms_nm=float(np.sqrt(np.mean(residual[mine] ** 2))),
-            predicted_nm=float(np.sqrt(np.mean(sigma[mine] ** 2))),
+            rms_nm=rms(residual[mine]),
+            predicted_nm=rms(sigma[mine]),
             coverage_68=coverage[0],
             coverage_68_ci95=intervals[0],
             coverage_95=coverage[1],

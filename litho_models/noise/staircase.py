@@ -13,6 +13,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
 from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
+from litho_models.scoring.statistics import rms
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
@@ -97,7 +98,7 @@ def step_print(
         deviations.append(np.abs(heights - np.median(heights)))
     records = []
     for number, step in enumerate(steps):
-        sigma = float(np.sqrt((sigmas[number] ** 2 + sigmas[number + 1] ** 2) / 2))
+        sigma = rms(sigmas[number : number + 2])
         # float32 heights of 1 µm carry 6e-5 nm.
         ratio = abs(step.height_nm) / max(sigma, 1e-4)
         records.append(
@@ -110,7 +111,7 @@ def step_print(
                 misread_if_gaussian=float(GAUSSIAN.probability_below(-ratio / 2)),
             )
         )
-    tread_sigma = float(np.sqrt(np.mean(np.square(sigmas))))
+    tread_sigma = rms(sigmas)
     block = max(1, round(_AREA_UM / pitch_across)), max(1, round(_AREA_UM / pitch_along))
     area_sigma = _sigma_of_block_means(flat, treads, block)
     return StepPrint(

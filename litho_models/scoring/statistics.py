@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
@@ -22,6 +23,11 @@ _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
 # The observed signs are among the flips; rounding must not put a sum below itself.
 _ROUNDING = 1 - 1e-12
+
+
+def rms(values: ArrayLike) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def bootstrap_interval(
