@@ -137,7 +137,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def page(self) -> str:
-        """Markdown with a Hugging Face front matter: what the model is, where it may be used, what it scored."""
+        """Markdown with a Hugging Face front matter: what the model is, where to use it, what it scored."""
         page = Path(__file__).with_name("readme.md.jinja")
         return filled(page, card=self, bounds=bounds_text(self.at_bounds))
 
