@@ -80,7 +80,7 @@ def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, An
     torch.set_num_threads(threads)
     settings = hologram_settings(changes={"layout.size_px": size_px})
     printer = load_printer(f"{zoo.PREFIX}{name}", settings.layout, device=device)
-    task = HologramTask(settings, printer, load_target("text", size_px))
+    task = HologramTask(settings, printer, inputs={"target": load_target("text", size_px).pixels})
     parameters = make_parametrisation(settings.layout, settings.search).to(device)
     parameters.start_random(0)
     level = parameters.sample(1.0, True, 0).detach().requires_grad_()

@@ -7,6 +7,7 @@ with 1 if one is not caught. It takes minutes, so it is no test itself.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -50,7 +51,7 @@ FAULTS = [
           "(length - (here + there) / 2)", "(length - here)", f"{OPTICS} -k band"),
     Fault("separations of a target of another size", "litho_design/optics/convolution.py",
           "torch.where(index < there, index, index - length)",
-          "torch.where(index < here, index, index - length)", f"{OPTICS} -k part"),
+          "torch.where(index < here, index, index - length)", f"{OPTICS} -k separation"),
     Fault("a decimetre", "litho_data/foundation/units.py", '"dm": 1e5', '"dm": 1e4', AXES),
     # Keys.
     Fault("own layouts by their shape", "litho_data/virtual_fab/simulate.py",
@@ -79,6 +80,11 @@ FAULTS = [
           'return str(self.root.attrs["dataset_sha256"])\n\n    @property', f"{WHOLE} -k hash"),
     Fault("chunks of zeros without a file", "litho_data/store/write.py",
           '"write_empty_chunks": True', '"write_empty_chunks": False', f"{WHOLE} -k every_chunk"),
+    Fault("a gain by the upper end of its interval", "litho_models/loop/judging.py",
+          "low, _ = bootstrap_interval", "_, low = bootstrap_interval",
+          "tests/litho_models/test_loop_search.py -k reason"),
+    Fault("what the prints know, upside down", "litho_models/planning/open_questions.py",
+          "information = stands_for * ", "information = 1 / stands_for * ", f"{NEXT} -k know"),
     # What is begun.
     Fault("begun is not said first", "litho_data/foundation/begun.py",
           "mark = Path(out), Path(out) / BEGUN", 'mark = Path(out), Path(out) / "other"', BEGUN),
@@ -104,7 +110,13 @@ FAULTS = [
     Fault("a scan freed by what it says itself", "litho_models/loop/closing.py",
           "own = np.flatnonzero(study.fold_of != fold).tolist()", "own = list(range(len(scans)))",
           f"{RUN} -k others_say"),
+    Fault("chosen with the print that is judged", "litho_models/loop/run.py",
+          "close_again([scan for scan in scans if scan.id not in out])", "close_again(scans)",
+          f"{RUN} -k judged_on"),
     # Reports.
+    Fault("a coverage under another level", "litho_models/noise/report.py",
+          "zip(one.levels, row.coverage, strict=True)", "zip(one.levels, row.coverage[::-1], strict=True)",
+          "tests/litho_models/test_noise_results.py -k coverage"),
     Fault("two columns swapped", "litho_models/evaluation/tables.py",
           '"mae_abs_nm": s.mae_abs_nm', '"mae_abs_nm": s.mae_datum_free_nm',
           "tests/litho_models/test_benchmark.py -k complete_on_disk"),
@@ -121,26 +133,20 @@ FAULTS = [
 ]  # fmt: skip
 
 
-def caught(fault: Fault, copy: Path) -> bool:
-    """Whether the tests of a fault fail with it."""
+def catches(fault: Fault, copy: Path) -> str:
+    """The test that fails with a fault; empty if none does."""
     file = copy / fault.file
     text = file.read_text(encoding="utf-8")
     assert text.count(fault.right) == 1, f"{fault.name}: {fault.file} no longer holds {fault.right!r} once"
     file.write_text(text.replace(fault.right, fault.wrong), encoding="utf-8")
     words, _, chosen = fault.tests.partition(" -k ")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        *words.split(),
-        *(["-k", chosen] if chosen else []),
-    ]
-    done = subprocess.run(command, cwd=copy, env={**os.environ, "PYTHONPATH": str(copy)}, capture_output=True)
+    command = [sys.executable, "-m", "pytest", "-qx", *words.split(), *(["-k", chosen] if chosen else [])]
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
     file.write_text(text, encoding="utf-8")
     # 1: tests failed; anything else is no answer.
-    return done.returncode == 1
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    return failed[1] if failed and done.returncode == 1 else ""
 
 
 def main(words: list[str]) -> int:
@@ -152,9 +158,9 @@ def main(words: list[str]) -> int:
             copy(ROOT / part, Path(folder) / part)
         for fault in FAULTS:
             if not words or any(word in fault.name for word in words):
-                noticed = caught(fault, Path(folder))
-                print(f"{'caught' if noticed else 'MISSED'}  {fault.name}", flush=True)
-                missed += not noticed
+                test = catches(fault, Path(folder))
+                print(f"{'caught' if test else 'MISSED'}  {fault.name}  {test}", flush=True)
+                missed += not test
     return missed
 
 

@@ -44,7 +44,7 @@ from litho_models.loop import bases, closing
 from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
-from litho_models.scan_terms import measurement
+from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import base_model, planted
@@ -143,7 +143,7 @@ def _planted(folder: Path) -> None:
     causes = [get_effect(one) for one in ("write-order-memory", "slope-thinning")]
     closing.screened_effects = lambda tip_radius_um: causes
     closing.LAWS, closing.TABLES = {}, {}
-    measurement._OFFERS = ()
+    measurement_fit._OFFERS = ()
     bases.build_model = lambda *name, **facts: base_model()
 
 

@@ -33,6 +33,7 @@ def require_tables_equal_record(
         with file.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream))
         assert rows, f"{file.name} is empty"
+        assert all(rows[0]), f"{file.name} has a column without a name"
         own = {column: named.get(column, column) for column in rows[0]}
         own = {column: field for column, field in own.items() if field and any(row[column] for row in rows)}
         unknown = sorted(set(own.values()) - fields)

@@ -30,6 +30,7 @@ TABLES = {
     "scan,mae_nm\nP11,2.5\n": "row 0",
     "scan,x\nP11,3.0\nP12,3.0\n": "row 1",
     "scan,ci95_nm\nP11,1.05 … 2.00\n": "row 0",
+    ",scan\n0,P11\n1,P12\n": "without a name",
 }
 
 

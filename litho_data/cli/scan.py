@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from litho_data.commands.app import argument, option
+from litho_data.commands.app import argument, keyword, option, takes_more
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX
 from litho_data.readers.registry import formats
@@ -20,38 +22,44 @@ if TYPE_CHECKING:
 
 
 ScanPath = Annotated[Path, argument("a scan in any supported format")]
-Format = Annotated[str, option(f"auto (by the content of the file), {', '.join(formats())}")]
-Unit = Annotated[str | None, option("unit of the heights if the file states none, e.g. m, nm")]
-Size = Annotated[
-    YX | None,
-    typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
-]
-ChannelName = Annotated[str | None, option("name of the height channel, if there are several")]
-Missing = Annotated[
-    list[str] | None,
-    option("number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
-]
-FullScale = Annotated[
-    float | None,
-    option("height in µm of the largest value of an integer image", "--full-scale-um"),
-]
+_READING: dict[str, Any] = {
+    "format": Annotated[str, option(f"auto (by the content of the file), {', '.join(formats())}")],
+    "unit": Annotated[str | None, option("unit of the heights if the file states none, e.g. m, nm")],
+    "size_um": Annotated[
+        YX | None,
+        typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
+    ],
+    "channel": Annotated[str | None, option("name of the height channel, if there are several")],
+    "full_scale_um": Annotated[
+        float | None, option("height in µm of the largest value of an integer image", "--full-scale-um")
+    ],
+    "missing": Annotated[
+        list[str] | None,
+        option("number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
+    ],
+}
 
 
-def marks(texts: list[str] | None) -> list[float | str] | None:
-    """Numbers and words as ``read_scan`` takes them."""
-    return None if texts is None else [number(one) if NUMBER.fullmatch(one) else one for one in texts]
+def reads_scans(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command options that say how a scan is read; it gets them as ``how``, for ``read_scan``."""
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        how = {name: values.pop(name) for name in _READING}
+        if marks := how["missing"]:
+            how["missing"] = [number(one) if NUMBER.fullmatch(one) else one for one in marks]
+        command(how=how, **values)
+
+    more = [keyword(name, kind, "auto" if name == "format" else None) for name, kind in _READING.items()]
+    return takes_more(run, command, more, without="how")
 
 
+@reads_scans
 def level(
     scan: ScanPath,
     recipe: Annotated[Path, option("levelling recipe (TOML)")],
     out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
-    format: Format = "auto",
-    unit: Unit = None,
-    size_um: Size = None,
-    channel: ChannelName = None,
-    full_scale_um: FullScale = None,
-    missing: Missing = None,
+    how: Mapping[str, Any],
 ) -> None:
     """Level one scan; writes the levelled heights, the removed surface and a record beside them.
 
@@ -62,15 +70,7 @@ def level(
     from litho_data.readers import read_scan
 
     steps = Recipe.from_toml(recipe)
-    heights = read_scan(
-        scan,
-        format=format,
-        unit=unit,
-        size_um=size_um,
-        channel=channel,
-        full_scale_um=full_scale_um,
-        missing=marks(missing),
-    )
+    heights = read_scan(scan, **how)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: typer.echo(f"warning: {message}", err=True)
         record = write_levelled(heights, steps, out)
@@ -79,14 +79,10 @@ def level(
     typer.echo(f"removed surface {out.with_name(record.removed)}")
 
 
+@reads_scans
 def inspect(
     file: ScanPath,
-    format: Format = "auto",
-    unit: Unit = None,
-    size_um: Size = None,
-    channel: ChannelName = None,
-    full_scale_um: FullScale = None,
-    missing: Missing = None,
+    how: Mapping[str, Any],
     picture: Annotated[Path | None, option("PNG to write")] = None,
     header: Annotated[bool, option("print the full header of the file", "--header")] = False,
 ) -> None:
@@ -99,25 +95,17 @@ def inspect(
     """
     from litho_data.readers import list_channels, read_scan
 
-    channels = list_channels(file, format=format)
+    channels = list_channels(file, format=how["format"])
     _print_channels(file, channels)
     if header:
         for listed in channels:
             for key, value in listed.header.items():
                 typer.echo(f"{listed.name}: {key} = {value}")
     try:
-        scan = read_scan(
-            file,
-            format=format,
-            unit=unit,
-            size_um=size_um,
-            channel=channel,
-            full_scale_um=full_scale_um,
-            missing=marks(missing),
-        )
+        scan = read_scan(file, **how)
     except InputError as error:
         # If no picture was asked for, the list of channels is enough.
-        if picture is not None or unit or size_um or channel or full_scale_um or missing:
+        if picture is not None or any(value for name, value in how.items() if name != "format"):
             raise
         typer.echo(f"no picture: {error}")
         return

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from litho_data.cli.scan import ChannelName, Format, FullScale, Missing, Size, Unit, marks
+from litho_data.cli.scan import reads_scans
 from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 
@@ -15,14 +16,10 @@ if TYPE_CHECKING:
     from litho_data.tip import TipEstimate
 
 
+@reads_scans
 def tip(
     scans: Annotated[list[Path], argument("one scan, or all scans of one tip, of the same pitch")],
-    format: Format = "auto",
-    unit: Unit = None,
-    size_um: Size = None,
-    channel: ChannelName = None,
-    full_scale_um: FullScale = None,
-    missing: Missing = None,
+    how: Mapping[str, Any],
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,
@@ -38,18 +35,7 @@ def tip(
     from litho_data.readers import read_scan
     from litho_data.tip import estimate_tip
 
-    read = [
-        read_scan(
-            file,
-            format=format,
-            unit=unit,
-            size_um=size_um,
-            channel=channel,
-            full_scale_um=full_scale_um,
-            missing=marks(missing),
-        )
-        for file in scans
-    ]
+    read = [read_scan(file, **how) for file in scans]
     found = estimate_tip(read)
     typer.echo(found.model_dump_json(by_alias=True, indent=1) if json else _text(found))
     if maps is None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-# What the first items take tells what the others will, and what is too short to be told.
+# What items take in this time tells what the others will, and what is too short to be told.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
 
 
@@ -38,16 +38,23 @@ def command_line(program: str | None = None) -> str:
 
 
 def progress(
-    items: Iterable[T], what: str, total: int | None = None, *, estimate_of: int | None = None
+    items: Iterable[T],
+    what: str,
+    total: int | None = None,
+    *,
+    estimate_of: int | None = None,
+    at_once: int = 1,
 ) -> Iterator[T]:
     """Iterate with a progress bar on stderr; without one if stderr is no terminal.
 
-    Once the first items tell how long the rest takes, and it is more than a minute, one line says so.
+    Once it is known how long the rest takes, and it is more than a minute, one line says so. The first items
+    do not tell, as what starts meanwhile is no part of the others, unless they take a minute themselves.
 
     Args:
         items: what is iterated over; ``what``: what is done with them.
         total: how many there are, where ``len`` does not tell.
         estimate_of: how many the estimate is of, by default all of these; 0 for none.
+        at_once: how many are worked on at a time.
     """
     from rich.console import Console
     from rich.progress import track
@@ -55,13 +62,15 @@ def progress(
     console = Console(stderr=True)
     count = total if total is not None else len(items) if isinstance(items, Sized) else 0
     wanted = count if estimate_of is None else estimate_of
-    started = time.monotonic()
     shown = track(items, description=what, total=total, console=console, disable=not console.is_terminal)
+    before, since = 0, time.monotonic()
     for done, item in enumerate(shown, start=1):
         yield item
-        seconds = time.monotonic() - started
-        if wanted and seconds > _TELLING_S:
-            say_estimate(what, seconds / done * (wanted - done))
+        now = time.monotonic()
+        if done == at_once and now - since < _MINUTE_S:
+            before, since = done, now
+        elif wanted and done - before >= at_once and now - since > _TELLING_S:
+            say_estimate(what, (now - since) / (done - before) * (wanted - done))
             wanted = 0
 
 

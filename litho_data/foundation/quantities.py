@@ -53,5 +53,4 @@ LEVELS = Range(2, 256)
 
 PitchUm = Annotated[float, Field(ge=PITCH_UM.low, le=PITCH_UM.high)]
 LevelHeightUm = Annotated[float, Field(ge=LEVEL_HEIGHT_UM.low, le=LEVEL_HEIGHT_UM.high)]
-LengthUm = Annotated[float, Field(ge=LENGTH_UM.low, le=LENGTH_UM.high)]
 Levels = Annotated[int, Field(ge=int(LEVELS.low), le=int(LEVELS.high))]

@@ -120,7 +120,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             say(f"building {source.card.name}: {len(todo)} of {len(source.jobs)} scans to do")
             making = functools.partial(finish, unfinished=partial)
             finished = run_jobs(making, todo, workers, name=lambda job: job.id)
-            for job, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
+            what = f"building {source.card.name}"
+            for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
                 if isinstance(outcome, Skipped):
                     # Recorded names: the manifest must not depend on where the raw files lie.
                     skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")

@@ -2,7 +2,7 @@
 
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform
-from litho_data.register.quality import RegistrationQuality, Thresholds
+from litho_data.register.quality import RegistrationQuality
 from litho_data.register.resample import resample_to_layout
 from litho_data.register.scan import Registration, centred_placement, register_scan
 from litho_data.register.topography import predicted_topography, smooth_measured
@@ -11,7 +11,6 @@ __all__ = [
     "Bend",
     "Registration",
     "RegistrationQuality",
-    "Thresholds",
     "apply_transform",
     "centred_placement",
     "predicted_topography",

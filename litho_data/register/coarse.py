@@ -7,7 +7,6 @@ import numpy as np
 from litho_data.foundation.kinds import Array
 from litho_data.register.features import Correspondence, match_features
 from litho_data.register.geometry import (
-    ORIENTATIONS,
     apply_transform,
     centre,
     linear_part,
@@ -50,7 +49,6 @@ def find_coarse(
     layout_level: Array,
     smooth_layout: Array,
     *,
-    search: bool,
     features: bool,
     seed: int,
 ) -> CoarseFit | None:
@@ -60,18 +58,16 @@ def find_coarse(
         scan: (ny, nx) heights at the layout's pitch without bow, NaN where not measured.
         layout_level: (ny, nx) integer levels.
         smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
-        search: try all eight orientations and both polarities, or only the identity.
         features: whether to match keypoints; on a layout that repeats itself they match everywhere.
         seed: of the robust estimators.
     """
-    allowed = (tuple(ORIENTATIONS), (1, -1)) if search else (("identity",), (1,))
-    hypotheses = search_orientation(scan, smooth_layout, *allowed)
+    hypotheses = search_orientation(scan, smooth_layout)
     if not hypotheses:
         return None
     best = _upright_if_tied(hypotheses)
     for orientation, polarity in _families(best, hypotheses) if features else ():
         fit = _fit_features(scan, layout_level, orientation, polarity, seed)
-        if fit is not None and fit.orientation in allowed[0]:
+        if fit is not None:
             return fit
     return CoarseFit(best.orientation, best.polarity, best.layout_to_oriented, None)
 

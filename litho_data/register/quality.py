@@ -58,34 +58,22 @@ class RegistrationQuality:
     noise_variance_factor: float
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Limits of a passed registration; docs/registration.md gives the reason for each."""
-
-    min_overlap: float = 0.5
-    min_ecc: float = 0.7
-    tre_median_warning_px: float = 1.0
-    max_tre_median_px: float = 1.5
-    max_corner_sd_px: float = 1.5
-    # Beyond this blur of the print (sigma), the two limits above grow with it.
-    blur_of_limits_px: float = 8.0
-    singular_range: tuple[float, float] = (0.90, 1.10)
-    singular_warning_range: tuple[float, float] = (0.95, 1.05)
-    max_layout_repeats: float = 0.9
-    max_second_alignment: float = 0.9
-    min_orientation_margin: float = 0.1
-    # From a slope of 1 on, two points of the scan may show the same position.
-    max_bend_slope: float = 1.0
+# Limits of a pass; docs/registration.md gives the reason for each.
+MIN_OVERLAP, MIN_ECC = 0.5, 0.7
+TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
+# Beyond this blur of the print (sigma), the last two grow with it.
+BLUR_OF_LIMITS_PX = 8.0
+SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
+MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
+# From a slope of 1 on, two points of the scan may show the same position.
+MAX_BEND_SLOPE = 1.0
 
 
-def judge(
-    figures: dict[str, Any], thresholds: Thresholds, blur_px: float, bend_um: Bend | None = None
-) -> tuple[bool, str, str]:
+def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) -> tuple[bool, str, str]:
     """(passed, reason, warning) for the figures of one registration; the reason names every failure.
 
     Args:
         figures: of the fit, the warp and the evidence.
-        thresholds: limits of a pass.
         blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
         bend_um: of the scan, in its own frame, if one was fitted.
     """
@@ -94,39 +82,38 @@ def judge(
     ecc, tre_px, repeats = figures["ecc"], figures["tre_median_px"], figures["layout_repeats"]
     margin, second = ecc - figures["second_orientation"], figures["second_alignment"]
     upright = figures["dihedral"] == "identity" and figures["polarity"] == 1
-    softness = max(1.0, blur_px / thresholds.blur_of_limits_px)
+    softness = max(1.0, blur_px / BLUR_OF_LIMITS_PX)
     overlap, spread_px, defects = figures["overlap"], figures["corner_sd_px"], figures["defect_share"]
-    fits, repeating = ecc >= thresholds.min_ecc, repeats > thresholds.max_layout_repeats
-    tied = fits and margin < thresholds.min_orientation_margin
-    low, high = thresholds.singular_range
-    warning_low, warning_high = thresholds.singular_warning_range
+    fits, repeating = ecc >= MIN_ECC, repeats > MAX_LAYOUT_REPEATS
+    tied = fits and margin < MIN_ORIENTATION_MARGIN
+    low, high = SINGULAR_RANGE
+    warning_low, warning_high = SINGULAR_WARNING_RANGE
     bent_um = 0.0 if bend_um is None else bend_um.largest
     how = "registered with a quadratic distortion"
     if bend_um is not None and bend_um.kind == "creep":
         how = "its lines creep along the slow axis, and are put back"
     # Written as "not >=", so that a figure that could not be computed fails.
     failures = {
-        f"correlation {ecc:.2f}, at least {thresholds.min_ecc} wanted": not fits,
+        f"correlation {ecc:.2f}, at least {MIN_ECC} wanted": not fits,
         f"ambiguous: the layout repeats itself, correlation {repeats:.2f} with its own shift": repeating,
         f"ambiguous: another shift correlates {second:.2f} times as well": fits
         and not repeating
-        and second > thresholds.max_second_alignment,
+        and second > MAX_SECOND_ALIGNMENT,
         f"ambiguous: another orientation or polarity correlates within {margin:.2f}": tied and not upright,
-        f"overlap {overlap:.2f}, at least {thresholds.min_overlap} wanted": not overlap
-        >= thresholds.min_overlap,
+        f"overlap {overlap:.2f}, at least {MIN_OVERLAP} wanted": not overlap >= MIN_OVERLAP,
         f"{scale}, {low} to {high} wanted; is the pitch right?": not low <= smallest <= largest <= high,
-        f"target registration error {tre_px:.2f} px": tre_px > softness * thresholds.max_tre_median_px,
+        f"target registration error {tre_px:.2f} px": tre_px > softness * MAX_TRE_MEDIAN_PX,
         "corners not determined": spread_px != spread_px,
-        f"corners known to {spread_px:.2f} px only": spread_px > softness * thresholds.max_corner_sd_px,
+        f"corners known to {spread_px:.2f} px only": spread_px > softness * MAX_CORNER_SD_PX,
         f"bent by up to {bent_um:.2f} µm, which may fold the scan": bend_um is not None
-        and not bend_um.slope < thresholds.max_bend_slope,
+        and not bend_um.slope < MAX_BEND_SLOPE,
     }
     warnings = {
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
         f"{defects:.1%} of the field shows something else than the print and is left out": defects > 0,
         f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
         "layout looks alike in another orientation; upright assumed": tied and upright,
-        f"target registration error {tre_px:.2f} px": tre_px > thresholds.tre_median_warning_px,
+        f"target registration error {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,
         "inverted contrast": figures["polarity"] == -1,
         "coarse fit by correlation, no feature matches": figures["method"] != "orb",
         "refinement did not converge": not figures["converged"],

@@ -24,7 +24,7 @@ from litho_data.register.geometry import (
 )
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.pyramid import FineFit, climb, refine_bent, refine_pyramid
-from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
+from litho_data.register.quality import MAX_LAYOUT_REPEATS, RegistrationQuality, judge, unregistered_quality
 from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
 from litho_data.register.topography import predicted_topography, remove_bow
@@ -67,12 +67,10 @@ def register_scan(
     layout_pitch_um: float,
     scan_pitch_um: YX | None = None,
     model: Model | Literal["ladder"] = "affine",
-    orientation: Literal["search", "identity"] = "search",
-    thresholds: Thresholds | None = None,
     fast_axis: Axis | None = None,
     seed: int = 0,
 ) -> Registration:
-    """Find the warp from a scan to its layout, and say how far it can be trusted.
+    """Find the warp from a scan to its layout, in any orientation and polarity, and how far to trust it.
 
     Args:
         scan: a ``Scan``, whose pitch is used, or heights (ny, nx) in µm, NaN where not measured.
@@ -80,8 +78,6 @@ def register_scan(
         layout_pitch_um: pitch of the layout.
         scan_pitch_um: (y, x) pitch of plain heights.
         model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
-        orientation: ``search`` tries eight orientations and both polarities, ``identity`` upright only.
-        thresholds: limits of a pass.
         fast_axis: of plain heights, along which the tip moved fast; ``x`` if unknown.
         seed: of the robust estimator and the bootstrap.
 
@@ -101,14 +97,12 @@ def register_scan(
         return Registration(centred, unregistered_quality("no measured pixel in the scan"))
     flat = remove_bow(at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
     has_structure = layout.min() < layout.max() and np.nanstd(flat) > SMALLEST_STRUCTURE_UM
-    limits = thresholds or Thresholds()
     smooth_layout = predicted_topography(layout, SEARCH_BLUR_PX)
     layout_repeats = rival_alignment(smooth_layout, smooth_layout) if has_structure else float("nan")
-    features = layout_repeats <= limits.max_layout_repeats
-    search = orientation == "search"
+    features = layout_repeats <= MAX_LAYOUT_REPEATS
     coarse = None
     if has_structure:
-        coarse = find_coarse(flat, layout, smooth_layout, search=search, features=features, seed=seed)
+        coarse = find_coarse(flat, layout, smooth_layout, features=features, seed=seed)
     if coarse is None:
         why = "no structure in the scan or the layout"
         if np.nanstd(flat) <= SMALLEST_STRUCTURE_UM:
@@ -124,9 +118,7 @@ def register_scan(
     if model == "ladder":
         fine = climb(fine)
     slow = slow_axis(coarse.orientation, fast_axis)
-    case = _Case(
-        height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed, defects, slow
-    )
+    case = _Case(height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, seed, defects, slow)
     straight, blocks = case.registration(coarse, fine)
     if model not in BENDABLE or not features:
         return straight
@@ -156,7 +148,6 @@ class _Case:
     layout_pitch_um: float
     centred: Array
     layout_repeats: float
-    limits: Thresholds
     seed: int
     defects: Array | None
     slow: int
@@ -186,7 +177,7 @@ class _Case:
             "mutual_information_after_bit": mutual_information_bit(after, layout),
             "noise_variance_factor": noise_variance_factor(self.scan_pitch_um, pitch_um),
         }
-        passed, reason, warning = judge(figures, self.limits, fine.blur_px, bend_um)
+        passed, reason, warning = judge(figures, fine.blur_px, bend_um)
         quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 

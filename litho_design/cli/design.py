@@ -34,6 +34,7 @@ from litho_design.optimisation.settings import DesignSettings
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 
 if TYPE_CHECKING:
+    from litho_design.judging.gap import GapResult
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
@@ -89,15 +90,9 @@ def first(
 
     Example: litho-design first --target ring
     """
-    from litho_design.reports.first import DESIGNER, WITHOUT, psnr_db
     from litho_design.workflows.first import first as make_first
 
-    scores = psnr_db(make_first(out, target=target, device=device))
-    print(
-        f"printed by {DESIGNER}: {scores[WITHOUT, DESIGNER]:.1f} dB designed without it, "
-        f"{scores[DESIGNER, DESIGNER]:.1f} dB designed with it"
-    )
-    print(out / "report.html")
+    _print_comparison(make_first(out, target=target, device=device), out)
 
 
 @takes_settings(HologramSettings())
@@ -245,7 +240,6 @@ def compare(
     else:
         kind = {"task": task.removeprefix("lens-")}
         settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
-    from litho_design.judging.gap import headline
     from litho_design.workflows.compare import compare as run_comparison
 
     result = run_comparison(
@@ -253,10 +247,7 @@ def compare(
         held_out_objects=held_out_objects or (), seeds=range(seeds), device=device,
         extrapolate=extrapolate, workers=workers, dask=dask,
     )  # fmt: skip
-    for item in result.summary:
-        if item.figure == headline(result.task)[0]:
-            print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
-    print(out / "report.html")
+    _print_comparison(result, out)
 
 
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
@@ -288,6 +279,15 @@ def _settings(
 
     window = measured_window(open_store(spread_of), made.window)
     return changed(made.model_copy(update={"window": window}), given.options)
+
+
+def _print_comparison(result: GapResult, out: Path) -> None:
+    from litho_design.judging.gap import headline
+
+    for item in result.summary:
+        if item.figure == headline(result.task)[0]:
+            print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
+    print(out / "report.html")
 
 
 def _print_design(design: Design, out: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from litho_design.holograms.bench import HologramBench, HologramScore, WindowedH
 from litho_design.holograms.loss import counted_pixels, hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
-from litho_design.images.targets import Target, load_target, stroke_width_px
+from litho_design.images.targets import TargetRecord, stroke_width_px
 from litho_design.optics import Optics
 from litho_design.optimisation.phases import gerchberg_saxton, nearest_levels
 from litho_design.printers.layout import LayoutSettings
@@ -31,7 +30,8 @@ class HologramTask(Task):
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
         printer: frozen model, or nominal heights.
-        target: wanted image of the size of the element.
+        inputs: ``target``, the wanted image of the size of the element, as ``load_target`` gives it with its
+            record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
@@ -54,26 +54,20 @@ class HologramTask(Task):
         self,
         settings: HologramSettings,
         printer: Printer,
-        target: Target,
+        *,
+        inputs: Mapping[str, np.ndarray],
         ensemble: Sequence[Printer] = (),
+        record: TargetRecord | None = None,
     ):
-        _check_target(target.pixels, settings.layout)
-        super().__init__(settings, printer, inputs={"target": target.pixels}, ensemble=ensemble)
+        target = inputs["target"]
+        _check_target(target, settings.layout)
+        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         if settings.loss.signal_window_um:
             self.headline = ("si_psnr_window_db", *self.headline[1:])  # type: ignore[misc]
-        self.target_record = target.record
-        self.notes += [f"target {target.record.adaptation}"] if target.record.adaptation else []
-        self.notes += _too_fine(target.pixels, settings)
-        self.target = torch.from_numpy(target.pixels).to(printer.device)
+        self.notes += [f"target {record.adaptation}"] if record and record.adaptation else []
+        self.notes += _too_fine(target, settings)
+        self.target = torch.from_numpy(target).to(printer.device)
         self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
-
-    @classmethod
-    def reopened(
-        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
-    ) -> HologramTask:
-        """The task of a finished design; the record of its target stays with the design."""
-        target = load_target(inputs["target"], printer.layout.size_px)
-        return cls(HologramSettings.model_validate(settings), printer, target)
 
     def make_bench(self, optics: Optics) -> HologramBench:
         """Light onto the image plane."""

@@ -57,11 +57,10 @@ class LoadedDesign:
         arrays = [name for name in self.record.files if name.endswith(".npy") and name not in own]
         # A design is opened to be scored: its task needs a device, and no model.
         nominal = Printer(None, self.record.layout, source="none").to(self.device)
-        self.task: Task = registered_task(self.record.task).reopened(
-            self.record.settings,
-            {name.removesuffix(".npy"): read_array(folder, name) for name in arrays},
-            nominal,
-        )
+        kind = registered_task(self.record.task)
+        inputs = {name.removesuffix(".npy"): read_array(folder, name) for name in arrays}
+        made = kind.settings_type.model_validate(self.record.settings)
+        self.task: Task = kind(made, nominal, inputs=inputs)
         self.bench = self.task.bench
         self.target = self.task.target if isinstance(self.task, HologramTask) else None
 

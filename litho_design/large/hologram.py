@@ -72,8 +72,8 @@ class BandedHologram(HologramTask):
         ranks, rows = bands.ranks, bands.rows()
         self.bands, self.total, self.leads = bands, ranks.total, ranks.rank == 0
         self.part = f"-{ranks.rank + 1}-of-{ranks.count}" if ranks.count > 1 else ""
-        Task.__init__(self, settings, printer)
-        self.target_record, self.counted = target.record, None
+        Task.__init__(self, settings, printer, record=target.record)
+        self.counted = None
         own = np.ascontiguousarray(target.pixels[rows.start : rows.stop])
         self.target = torch.from_numpy(own).to(printer.device)
         self.notes = [_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"]

@@ -16,6 +16,8 @@ from litho_design.lenses.settings import LensSettings
 _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
+# Among the inputs of a lens: (pictures, size, size), those of the design first.
+_PICTURES = "object_pictures"
 
 
 def object_stack(
@@ -44,8 +46,8 @@ def with_objects(
     are held out of the design and only scored. Without ``objects`` the design uses the drawings.
 
     Returns:
-        The settings, with name, SHA-256 and conversion of each picture, and the pixels by SHA-256 for
-        ``lens_task``; unchanged settings and no pixels where no path is given.
+        The settings, with name, SHA-256 and conversion of each picture, and the pixels as inputs of the task;
+        unchanged settings and no inputs where no path is given.
 
     Raises:
         InputError: a task that images no objects, a file that is not a picture, a picture without light or
@@ -75,7 +77,17 @@ def with_objects(
             hint="give more pictures with --objects or --held-out-objects",
         )
     update = {"test_objects": tuple(tested)} | ({"objects": tuple(kept)} if kept else {})
-    return settings.model_copy(update={"imaging": imaging.model_copy(update=update)}), pictures
+    made = settings.model_copy(update={"imaging": imaging.model_copy(update=update)})
+    used = picture_records((*made.imaging.objects, *made.imaging.test_objects))
+    return made, {_PICTURES: np.stack([pictures[one.sha256] for one in used])}
+
+
+def pictures_of(objects: Sequence[ImagedObject], inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Pixels of the pictures among the objects of design and test, by the SHA-256 of their files."""
+    return {
+        one.sha256: pixels
+        for one, pixels in zip(picture_records(objects), inputs.get(_PICTURES, ()), strict=False)
+    }
 
 
 def picture_records(objects: Sequence[ImagedObject]) -> list[TargetRecord]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
 from litho_data.foundation.errors import InputError
+from litho_design.images.targets import TargetRecord
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
@@ -20,7 +21,7 @@ from litho_design.lenses.bench import (
     record,
     sensor_psf,
 )
-from litho_design.lenses.objects import object_stack, picture_records, pictures_note
+from litho_design.lenses.objects import object_stack, pictures_note, pictures_of
 from litho_design.lenses.score import (
     ImagingLensScore,
     LensScore,
@@ -37,21 +38,15 @@ from litho_design.tasks.task import Task, register_task
 
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
-_PICTURES = "object_pictures"
 _PLANE_NOTE = (
     "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
 )
 
 
-def lens_task(
-    settings: LensSettings,
-    printer: Printer,
-    ensemble: Sequence[Printer] = (),
-    pictures: Mapping[str, np.ndarray] | None = None,
-) -> LensTask:
+def lens_task(settings: LensSettings, printer: Printer, **given: Any) -> LensTask:
     """The task that ``settings.task`` names, with arguments and errors of ``LensTask``."""
     kind = DirectLensTask if settings.task == "direct" else ComputationalLensTask
-    return kind(settings, printer, ensemble, pictures)
+    return kind(settings, printer, **given)
 
 
 class LensTask(Task):
@@ -61,7 +56,7 @@ class LensTask(Task):
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
         ensemble: further models in the loss, as for ``Task``.
-        pictures: pixels of the objects that are pictures (see ``with_objects``).
+        inputs: pixels of the objects that are pictures, as ``with_objects`` gives them.
 
     Raises:
         InputError: a radial search of a layout without rings or with a square aperture, a start for
@@ -85,16 +80,18 @@ class LensTask(Task):
         self,
         settings: LensSettings,
         printer: Printer,
+        *,
+        inputs: Mapping[str, np.ndarray] | None = None,
         ensemble: Sequence[Printer] = (),
-        pictures: Mapping[str, np.ndarray] | None = None,
+        record: TargetRecord | None = None,
     ):
         _check(settings)
-        self.pictures, imaging = dict(pictures or {}), settings.imaging
-        self.objects = object_stack(imaging.objects, imaging.object_px, self.pictures).to(printer.device)
-        records = picture_records((*imaging.objects, *imaging.test_objects))
-        stack = object_stack(records, imaging.object_px, self.pictures).numpy() if records else None
-        inputs = {} if stack is None else {_PICTURES: stack}
-        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble)
+        imaging = settings.imaging
+        objects = (*imaging.objects, *imaging.test_objects)
+        self.pictures = pictures_of(objects, inputs or {})
+        stack = object_stack(objects, imaging.object_px, self.pictures)
+        self.objects = stack[: len(imaging.objects)].to(printer.device)
+        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
         self.strips = (
@@ -105,17 +102,6 @@ class LensTask(Task):
         self.notes += [_PLANE_NOTE] if rings and placed else []
         self.notes += _narrow_window(self.bench)
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
-
-    @classmethod
-    def reopened(
-        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
-    ) -> LensTask:
-        """The task of a finished design."""
-        made = LensSettings.model_validate(settings)
-        records = picture_records((*made.imaging.objects, *made.imaging.test_objects))
-        pixels = inputs.get(_PICTURES, ())
-        pictures = {one.sha256: picture for one, picture in zip(records, pixels, strict=True)}
-        return cls(made, printer, (), pictures)
 
     def make_bench(self, optics: Optics) -> LensBench:
         """Light onto the focal window."""

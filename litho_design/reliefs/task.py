@@ -72,16 +72,15 @@ class ReliefTask(Task):
         settings: ReliefSettings,
         printer: Printer,
         *,
-        inputs: Mapping[str, np.ndarray] | None = None,
+        inputs: Mapping[str, np.ndarray],
         ensemble: Sequence[Printer] = (),
         record: TargetRecord | None = None,
     ):
-        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble)
+        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
         # What the model has to print, so that the printer prints the target.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
-        self.target_record = record
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
         span_um, reach_um = float(np.ptp(self.inputs["relief_um"])), max(heights) - min(heights)

@@ -170,8 +170,11 @@ def _judged(folder: Path, result: GapResult, printers: Mapping[str, Printer]) ->
 
 
 def _pictures(judged: _Judged) -> Figure:
+    target = next(iter(judged.values()))[0].target
+    wanted = {} if target is None else {"wanted": target.cpu().numpy()}
     rows = {
-        arm: {
+        arm: wanted
+        | {
             f"{arm}:\n{'in design' if name == arm else f'printed by {name}'}": loaded.display(image)
             for name, image in by_judge.items()
         }

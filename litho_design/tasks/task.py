@@ -71,6 +71,7 @@ class Task:
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
         ensemble: further models: the loss is the worst over all, or the mean, plus a penalty on what they
             disagree about.
+        record: where the inputs come from.
 
     Raises:
         InputError: a start that the task does not have, or spreads beyond the range of the propagator.
@@ -92,6 +93,7 @@ class Task:
         *,
         inputs: Mapping[str, np.ndarray] | None = None,
         ensemble: Sequence[Printer] = (),
+        record: TargetRecord | None = None,
     ):
         start = settings.search.start
         if start not in self.starts:
@@ -99,7 +101,7 @@ class Task:
             raise InputError("start", got=repr(start), wanted=wanted)
         self.settings, self.printer, self.printers = settings, printer, [printer, *ensemble]
         self.inputs = dict(inputs or {})
-        self.target_record: TargetRecord | None = None
+        self.target_record = record
         self.notes: list[str] = []
         # Models of the printer that take no part in the search.
         self.judges: Sequence[Printer] = ()
@@ -181,8 +183,8 @@ class Task:
             return None
         optics = self.settings.optics.model_copy(update={"element": "thick"})
         nominal = Printer(None, self.settings.layout, source="none").to(self.printer.device)
-        settings = self.settings.model_copy(update={"optics": optics}).model_dump()
-        return self.reopened(settings, self.inputs, nominal).score(height_um)
+        settings = self.settings.model_copy(update={"optics": optics})
+        return type(self)(settings, nominal, inputs=self.inputs).score(height_um)
 
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
         """Figures of one draw of the process window."""
@@ -245,13 +247,6 @@ class Task:
         return np.concatenate(rows)
 
     # What every task shares.
-
-    @classmethod
-    def reopened(
-        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
-    ) -> Task:
-        """The task of a finished design, from its record and its arrays."""
-        return cls(cls.settings_type.model_validate(settings), printer, inputs=inputs)
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:

@@ -40,8 +40,6 @@ from litho_design.tasks.design import DESIGNS, Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
 
-# Writes what people read into the folder of a comparison.
-GapReport = Callable[[Path, GapResult, Mapping[str, Printer]], object]
 Models = Mapping[str, str | Path | Printer] | Iterable[str | Printer]
 
 
@@ -62,7 +60,6 @@ def compare(
     announce: bool = True,
     workers: int = 1,
     dask: str | None = None,
-    report: GapReport = write_gap_report,
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
@@ -81,7 +78,6 @@ def compare(
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
         workers: local processes; ``dask``: address of a Dask scheduler instead. They design.
-        report: writes the report; the designs are in the folder then.
 
     Returns:
         The record written to ``out/gap.json``.
@@ -107,11 +103,12 @@ def compare(
             raise InputError(
                 "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
             )
-        make = partial(HologramTask, target=load_target(target, settings.layout.size_px))
+        wanted = load_target(target, settings.layout.size_px)
+        make = partial(HologramTask, inputs={"target": wanted.pixels}, record=wanted.record)
     else:
         assert isinstance(settings, LensSettings)
-        settings, pictures = with_objects(settings, objects, held_out_objects)
-        make = partial(lens_task, pictures=pictures)
+        settings, inputs = with_objects(settings, objects, held_out_objects)
+        make = partial(lens_task, inputs=inputs)
 
     everyone = {**designers, **others}
     jobs: list[_Job] = []
@@ -139,7 +136,7 @@ def compare(
             summary=summarise(entries),
             paired=paired_differences(entries, headline(designs[0].task) or tuple(designs[0].predicted)),
         )
-        report(folder, result, everyone)
+        write_gap_report(folder, result, everyone)
         result.write(folder)
     return result
 

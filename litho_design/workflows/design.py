@@ -83,7 +83,8 @@ def design_hologram(
         wanted = load_target(target, made.layout.size_px)
         if band_px is not None:
             return BandedHologram(made, printer, wanted, bands)
-        return HologramTask(made, printer, wanted, others)
+        inputs = {"target": wanted.pixels}
+        return HologramTask(made, printer, inputs=inputs, ensemble=others, record=wanted.record)
 
     return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 
@@ -128,8 +129,8 @@ def design_lens(
     def task(printer: Printer, others: list[Printer]) -> Task:
         if tile_px is not None:
             return RingLens(made, printer, tile_px)
-        imaging, pictures = with_objects(made, objects, held_out_objects)
-        return lens_task(imaging, printer, others, pictures)
+        imaging, inputs = with_objects(made, objects, held_out_objects)
+        return lens_task(imaging, printer, inputs=inputs, ensemble=others)
 
     return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
 

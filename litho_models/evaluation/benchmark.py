@@ -121,7 +121,7 @@ def benchmark(
         # Models differ too much for one estimate where each tells its own.
         of = len(jobs) if places.elsewhere else 0
         for (name, fold, *_), (record, heights) in progress(
-            done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of
+            done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of, at_once=workers
         ):
             if fold is plan[0] and not of:
                 rest = (len(plan) - 1) * (time.monotonic() - started)

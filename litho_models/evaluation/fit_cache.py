@@ -24,7 +24,8 @@ from litho_models.prediction.cost import PredictionCost, measured_predictions
 from litho_models.prediction.tiles import predict_scan, tile_difference
 from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background, learn_background
-from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.measurement_fit import learn_measurement
 from litho_models.scoring.metrics import mean_error_nm
 from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator

@@ -9,6 +9,7 @@ import builtins
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from litho_data.foundation.errors import unknown_name
 from litho_models.frozen import hub
@@ -32,7 +33,7 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
     """
     known = list(root)
     if name == BEST and known:
-        name = min(known, key=lambda one: _held_out_nm(Path(root) / one))
+        name = min(known, key=lambda one: _held_out_nm(one, root))
     if name not in known:
         names = [*known, BEST] if known else []
         raise unknown_name("zoo model", name, names, "" if known else "`make zoo` trains it")
@@ -60,7 +61,17 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
     return Path(source)
 
 
-def _held_out_nm(folder: Path) -> float:
+def card(name: str, root: str | Path = ZOO_FOLDER) -> dict[str, Any]:
+    """What the card of a model in the zoo says, by the names of ``ModelCard``; its weights stay unread.
+
+    Raises:
+        InputError: no such model.
+    """
+    found: dict[str, Any] = json.loads((folder(name, root) / _CARD_FILE).read_text(encoding="utf-8"))
+    return found
+
+
+def _held_out_nm(name: str, root: str | Path) -> float:
     """The first figure of a card: the error on held-out scans."""
-    metrics = json.loads((folder / _CARD_FILE).read_text(encoding="utf-8"))["metrics"]
+    metrics = card(name, root)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")

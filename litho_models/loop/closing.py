@@ -25,7 +25,8 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable
-from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # A law is a short formula: two terms at most.
 MOST_LAWS, MOST_TABLES = 2, 2

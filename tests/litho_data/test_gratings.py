@@ -41,6 +41,14 @@ def test_the_bow_of_a_line_is_the_scanners_and_not_the_printers():
             assert found.bow_sd_um < 0.02
 
 
+def test_the_zero_of_its_heights_means_nothing():
+    scan, found = scanned(KnobSetting("piezo-nonlinearity", 0.04))
+    lifted = grating_scan("G", scan.height_um + 50.0, (scan.frame.pitch_um,) * 2, KNOWN)
+    for name in ("bow_um", "scale_x", "scale_y"):
+        # A float32 of 50 µm is known to 4 nm, and thousands of pixels are averaged.
+        assert getattr(lifted, name) == pytest.approx(getattr(found, name), rel=1e-3)
+
+
 def test_the_scales_are_those_of_the_scan_within_their_uncertainty():
     for seed in (3, 4, 5):
         scan, found = scanned(scale=0.02, seed=seed)

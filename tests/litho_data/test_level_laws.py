@@ -92,6 +92,13 @@ def test_the_facet_of_a_plane_is_the_plane(slope_x: float, slope_y: float) -> No
     assert np.ptp(level_facet(z, pitch_um=PITCH_UM).height) < 1e-4 * 3
 
 
+def test_four_cells_are_enough_for_a_facet_and_three_are_not() -> None:
+    z = ramp((3, 3), 0.3, 0.002, -0.003)
+    assert np.ptp(level_facet(z, pitch_um=PITCH_UM).height) < 1e-4
+    with pytest.raises(InputError, match="3 cells"):
+        level_facet(z[:2, [0, 1, 2, 2]], pitch_um=PITCH_UM)
+
+
 def test_facets_see_terraces_and_not_their_steps() -> None:
     terraces = 0.1 * np.repeat(np.arange(6), 10)[None, :] + np.zeros((40, 1))
     tilted = terraces + ramp(terraces.shape, 0.0, 0.02 * PITCH_UM[1], -0.05 * PITCH_UM[0])

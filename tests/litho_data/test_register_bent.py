@@ -16,7 +16,7 @@ from litho_data.provenance.verify import verify
 from litho_data.register import Bend, Registration, apply_transform, register_scan, resample_to_layout
 from litho_data.register.bend import fit_bent_affine
 from litho_data.register.geometry import index_to_um, orient, orientation_matrix
-from litho_data.register.quality import Thresholds, judge
+from litho_data.register.quality import judge
 from litho_data.register.refine import refine
 from litho_data.store import open_store
 from litho_data.virtual_fab import KnobSetting, Truth, simulate
@@ -30,6 +30,7 @@ from tests.litho_data.register_phantoms import (
     random_layout,
     warp_about_centre,
 )
+from tests.litho_data.test_register_quality import GOOD
 
 SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
 AMOUNT_UM = np.array([[0.66, -0.45, 0.54], [-0.6, 0.72, 0.39]])
@@ -149,18 +150,12 @@ def test_no_bend_makes_a_wrong_scan_pass(case):
 
 
 def test_a_bend_that_may_fold_the_scan_is_refused():
-    figures = {
-        **{"ecc": 0.95, "second_orientation": 0.3, "layout_repeats": 0.2, "second_alignment": 0.3},
-        **{"singular_min": 1.0, "singular_max": 1.0, "overlap": 1.0, "tre_median_px": 0.3},
-        "defect_share": 0.0,
-        **{"corner_sd_px": 0.2, "dihedral": "identity", "polarity": 1, "method": "orb", "converged": True},
-    }
     # d(shift)/dx is 2 a u / half: at u = 1 it reaches 1 for a = half / 2.
     half_um = bend_of().half[0]
     for share, passed in ((0.99, True), (1.01, False)):
         bend = Bend(np.array([[share * half_um / 2, 0, 0], [0, 0, 0]]), bend_of().middle, bend_of().half)
         assert bend.slope == pytest.approx(share, rel=1e-12)
-        assert judge(figures, Thresholds(), 2.0, bend)[0] is passed
+        assert judge(GOOD, 2.0, bend)[0] is passed
 
 
 def test_undo_is_the_inverse_of_straighten_up_to_the_fold():

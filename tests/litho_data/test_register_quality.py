@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_data.register.pyramid import BLURS_PX, match_blur
-from litho_data.register.quality import Thresholds, judge
+from litho_data.register.quality import judge
 
 GOOD = {
     **{"ecc": 0.95, "second_orientation": 0.3, "layout_repeats": 0.2, "second_alignment": 0.3},
@@ -24,7 +24,7 @@ GOOD = {
 
 
 def test_a_good_fit_passes_without_a_word():
-    assert judge(GOOD, Thresholds(), 2.0) == (True, "", "")
+    assert judge(GOOD, 2.0) == (True, "", "")
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_a_good_fit_passes_without_a_word():
     ],
 )
 def test_limits_warn_before_they_fail_and_grow_with_the_blur(figures, blur_px, passed, warned):
-    found, reason, warning = judge(GOOD | figures, Thresholds(), blur_px)
+    found, reason, warning = judge(GOOD | figures, blur_px)
     assert found is passed
     assert bool(reason) is not passed
     assert ("target registration error" in warning) is warned

@@ -295,7 +295,7 @@ def test_toy_reaches_the_true_optimum():
 
 
 def test_polish_of_many_cells_never_raises_the_loss(small_settings, make_printer, target):
-    task = HologramTask(small_settings, make_printer(small_settings.layout), target)
+    task = HologramTask(small_settings, make_printer(small_settings.layout), inputs={"target": target.pixels})
     cells = CellMap(small_settings.layout)
     levels = torch.randint(0, 13, (32, 32), generator=torch.Generator().manual_seed(0))
     polished, losses = polish_levels(levels, cells, task.objective, level_count=13, rounds=15)

@@ -76,8 +76,9 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
     assert apart[20.0] < 0.8 * apart[0.0]
     # The mean over the members, or the worst of them, and their disagreement in waves.
     main, other = models()
+    inputs = {"target": target.pixels}
     level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
-    alone = [float(HologramTask(small_settings, p, target).objective(level)[0]) for p in (main, other)]
+    alone = [float(HologramTask(small_settings, p, inputs=inputs).objective(level)[0]) for p in (main, other)]
     waves = measure_disagreement(
         [main, other], level, small_settings.optics.wave_height_um
     ).disagreement_waves
@@ -87,7 +88,8 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         ("mean", 3.0, sum(alone) / 2 + 3 * waves),
     ):
         ensemble = small_settings.ensemble.model_copy(update={"weight": weight, "risk": risk})
-        both = HologramTask(small_settings.model_copy(update={"ensemble": ensemble}), main, target, [other])
+        settings = small_settings.model_copy(update={"ensemble": ensemble})
+        both = HologramTask(settings, main, inputs=inputs, ensemble=[other])
         assert float(both.objective(level)[0]) == pytest.approx(wanted, rel=1e-5)
 
 

@@ -16,7 +16,7 @@ from litho_data.foundation.run_facts import run_facts
 from litho_design import design_hologram, hologram_settings, score
 from litho_design.cli.app import app, main
 from litho_design.printers.layout import LayoutSettings
-from litho_design.printers.source import JUDGES, load_printer
+from litho_design.printers.source import JUDGES, load_printer, models_at_hand
 from litho_design.printers.training import OutOfDistribution
 from litho_design.reports.advice import distribution_warning, spread_sentence, stroke_advice
 from litho_design.tasks.design import Design
@@ -151,7 +151,7 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert {record.run.commit, judged["commit"], gap["commit"]} == {run_facts()["commit"]}
 
 
-def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path):
+def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeypatch):
     """And says how far they are apart: as stated, in the median and at worst."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
     few = {"search.polish_rounds": 0, "window.yield_draws": 2, "window.defocus_sd_um": 0.5}
@@ -172,6 +172,10 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path):
     assert alone.printer.dataset_sha256 == ""
     with pytest.raises(InputError, match="nothing to judge with"):
         score(tmp_path / "none", tmp_path / "empty")
+    # Those of another printer are left out by their cards, before any weights are read.
+    foreign = design.printer.model_copy(update={"dataset_sha256": 64 * "f"})
+    monkeypatch.setattr("litho_design.printers.source.load_printer", None)
+    assert models_at_hand([foreign], settings.layout) == []
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,14 @@ import torch
 from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture
 from litho_design.holograms.loss import HologramLoss, hologram_loss
 from litho_design.holograms.settings import CameraView
-from litho_design.images.similarity import SSIM_WINDOW_PX, matched_scale, si_psnr_db, similarity, ssim
+from litho_design.images.similarity import (
+    SSIM_WINDOW_PX,
+    light_figures,
+    matched_scale,
+    si_psnr_db,
+    similarity,
+    ssim,
+)
 from litho_design.images.targets import draw_target
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
@@ -83,6 +90,22 @@ def test_fully_developed_speckle_has_unit_contrast():
     score = hologram_score([(1.0, speckle)], speckle, target, grid, Optics(), CameraView())
     # 32768 independent samples of an exponential distribution: sd of the contrast about 0.006.
     assert score.speckle_contrast == pytest.approx(1, abs=0.03)
+    # Of a target without greys both figures count the same half of the light.
+    assert score.eff_paper == score.eff_signal == pytest.approx(score.eff_window / 2, rel=0.03)
+
+
+def test_the_light_of_four_pixels():
+    share, target = torch.tensor([[1.0, 3.0], [0.5, 0.0]]), torch.tensor([[1.0, 0.6], [0.5, 0.0]])
+    wanted = {
+        "eff_signal": 4.0,
+        "eff_window": 4.5,
+        # They lie 1 from their mean of 2.
+        "speckle_contrast": 0.5,
+        # Between 1.1 and 2.9, a twentieth from either end.
+        "uniformity": 1 - 1.8 / 4,
+        "background_ratio": 8.0,
+    }
+    assert light_figures(share, target) == pytest.approx(wanted)
 
 
 def test_si_psnr_ignores_scale():

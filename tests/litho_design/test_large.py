@@ -70,7 +70,7 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
     level = (12 * torch.rand(1, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(0))).requires_grad_()
     found = []
     for task in (
-        HologramTask(settings, printer, target),
+        HologramTask(settings, printer, inputs={"target": target.pixels}),
         BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4)),
     ):
         loss, _ = task.objective(level)

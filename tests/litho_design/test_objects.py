@@ -14,7 +14,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.images.targets import draw_target, object_name
 from litho_design.judging.gap import GapResult
-from litho_design.lenses.objects import object_stack, picture_records, read_object, with_objects
+from litho_design.lenses.objects import object_stack, picture_records, pictures_of, read_object, with_objects
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import LensTask, lens_task
 from litho_design.optics import Optics
@@ -59,9 +59,9 @@ def folder(tmp_path):
 
 
 def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
-    brought, pictures = with_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
+    brought, inputs = with_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
     (record,) = picture_records(("ring", *brought.imaging.objects))
-    ring, picture = object_stack(("ring", record), 32, pictures)
+    ring, picture = object_stack(("ring", record), 32, pictures_of([record], inputs))
     inside = slice(4, 28)
     assert torch.equal(ring[inside, inside], torch.from_numpy(draw_target("ring", 24)))
     grey = cv2.imread(str(folder / "a.png"), cv2.IMREAD_GRAYSCALE).astype(np.float32)
@@ -78,7 +78,7 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
     grey = np.full((24, 24), 7, np.uint16)
     grey[0, 0] = 70
     cv2.imwrite(str(tmp_path / "deep.png"), grey)
-    brought, pictures = with_objects(settings, [], [tmp_path / "wide.png", tmp_path / "deep.png"])
+    brought, inputs = with_objects(settings, [], [tmp_path / "wide.png", tmp_path / "deep.png"])
     wide, deep = brought.imaging.test_objects
     assert brought.imaging.objects == settings.imaging.objects
     assert (wide.name, wide.sha256) == ("wide.png", file_sha256(tmp_path / "wide.png"))
@@ -87,6 +87,7 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
         "24 px; divided by its brightest value; dark border of 4 px"
     )
     assert deep.adaptation == "divided by its brightest value; dark border of 4 px"
+    pictures = pictures_of([wide, deep], inputs)
     seen = pictures[wide.sha256]
     assert seen.shape == (32, 32)
     # 12 of the 24 rows are light: full on the left, half on the right. Luma is 59.8 against 29.9, and a
@@ -163,12 +164,12 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
 
 
 def test_pixels_must_belong_to_the_settings(folder, settings, make_printer):
-    brought, pictures = with_objects(settings, [folder], [])
+    brought, inputs = with_objects(settings, [folder], [])
     with pytest.raises(InputError, match=r"object a\.png, got no pixels"):
         lens_task(brought, make_printer(settings.layout))
     wider = brought.model_copy(update={"imaging": brought.imaging.model_copy(update={"object_px": 48})})
     with pytest.raises(InputError, match=r"pixels of shape \(32, 32\)"):
-        lens_task(wider, make_printer(settings.layout), pictures=pictures)
+        lens_task(wider, make_printer(settings.layout), inputs=inputs)
 
 
 def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):

@@ -21,6 +21,7 @@ from litho_design.optics import (
     sampling_limit_um,
 )
 from litho_design.optics.angular_spectrum import spectrum_axes
+from litho_design.optics.convolution import wrapped_order
 
 pytestmark = pytest.mark.numerics
 
@@ -74,6 +75,14 @@ def test_adjoint_and_gradient(name):
     assert (forward - backward).abs().item() < 1e-10 * forward.abs().item()
     forward.real.backward()
     assert torch.allclose(u.grad, propagate.adjoint(v), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(("here", "there"), [(34, 31), (31, 34), (33, 33), (1, 40), (40, 1)])
+def test_every_separation_lies_where_a_circular_convolution_looks_for_it(here, there):
+    order = wrapped_order(here, there).tolist()
+    for separation in range(1 - here, there):
+        assert order[separation % len(order)] == separation
+    assert set(order) == set(range(1 - here, there))
 
 
 @pytest.mark.parametrize("distance", [900.0, 6000.0, -6000.0])

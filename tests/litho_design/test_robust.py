@@ -15,6 +15,8 @@ from litho_design.optimisation.process_window import Draw, ProcessWindow, draws,
 from litho_design.tasks.design import HEIGHT_FILE
 from litho_design.workflows.design import design_hologram
 
+RING = {"target": load_target("ring", 128).pixels}
+
 
 def test_draws_have_their_spread_and_repeat():
     window = ProcessWindow(gain_sd=0.05, defocus_sd_um=4.0, wavelength_sd_um=0.001)
@@ -31,7 +33,7 @@ def test_a_yield_is_of_prints_that_no_search_saw(small_settings, make_printer):
     searched, unseen = draws(window, Optics(), 16), draws(window, Optics(), 16, unseen=True)
     assert not {draw.gain for draw in searched} & {draw.gain for draw in unseen}
     assert unseen[:3] == draws(window, Optics(), 3, unseen=True)
-    task = HologramTask(small_settings, make_printer(small_settings.layout), load_target("ring", 128))
+    task = HologramTask(small_settings, make_printer(small_settings.layout), inputs=RING)
     height = torch.rand(128, 128, generator=torch.Generator().manual_seed(0))
     told = [score["eff_signal"] for score in task.window_scores(height, 2)]
     seen_by_score = draws(small_settings.window, small_settings.optics, 2, unseen=True)
@@ -43,7 +45,7 @@ def test_a_yield_is_of_prints_that_no_search_saw(small_settings, make_printer):
 def test_a_spread_without_a_positive_wavelength_is_refused(small_settings, make_printer):
     wide = small_settings.model_copy(update={"window": ProcessWindow(wavelength_sd_um=1.0)})
     with pytest.raises(InputError, match=r"spread of 1 µm.*wavelength-sd-um"):
-        HologramTask(wide, make_printer(wide.layout), load_target("ring", 128))
+        HologramTask(wide, make_printer(wide.layout), inputs=RING)
 
 
 def test_risk_formulas():
@@ -74,7 +76,7 @@ def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
         )
     assert not (tmp_path / "near").exists()
     calm = settings.model_copy(update={"window": ProcessWindow(defocus_sd_um=0.1)})
-    HologramTask(calm, make_printer(settings.layout), load_target("ring", 128))
+    HologramTask(calm, make_printer(settings.layout), inputs=RING)
 
 
 @pytest.mark.long
@@ -87,7 +89,7 @@ def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, 
     risks = {}
     # Other draws than those of the search: what it gained must hold for prints it has not seen.
     unseen = robust.model_copy(update={"window": spread.model_copy(update={"seed": 1})})
-    judge = HologramTask(unseen, make_printer(robust.layout), target)
+    judge = HologramTask(unseen, make_printer(robust.layout), inputs={"target": target.pixels})
     for name, settings in (("nominal", nominal), ("robust", robust)):
         design_hologram(
             target, make_printer(settings.layout), tmp_path / name, settings=settings, announce=False

@@ -26,7 +26,7 @@ from litho_models.loop.model import Twin
 from litho_models.loop.run import close_loop
 from litho_models.loop.search import search
 from litho_models.models import build_model
-from litho_models.scan_terms import measurement
+from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.simulator import Simulator
 from tests.litho_models.loop_scans import (
@@ -84,7 +84,7 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
     base: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the training of the base to the law, the print and what scans share."""
-    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
+    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
     study = settings_of(scans)
     out = np.flatnonzero(study.fold_of == 1).tolist()

@@ -11,13 +11,20 @@ import torch
 from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
-from litho_models import build_model, load_frozen, save_frozen, zoo
+from litho_models import build_model, load_frozen, save_frozen
 from litho_models.cli.app import app
 from litho_models.frozen.exporting import LARGEST_DIFFERENCE_UM, export_model
 from litho_models.frozen.simulator import FrozenSimulator
 
 SIZE_PX = 48
-CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear", "features")
+FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep_um": (0.3,)}
+SETTINGS = {
+    "affine-mtf": {"sigmas_um": (0.1, 0.3)},
+    "linear": {"sigmas_um": (0.1, 0.3)},
+    # All of its operations, on few features.
+    "pbl": {"sigma_diffusion_init_um": 0.2, "surroundings": FEW, "scan_axis": FEW},
+}
+CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 
 
 def layout(seed: int, size_px: int = SIZE_PX) -> torch.Tensor:
@@ -26,11 +33,11 @@ def layout(seed: int, size_px: int = SIZE_PX) -> torch.Tensor:
 
 
 def frozen(name: str, folder: Path) -> FrozenSimulator:
-    """One of the zoo, or a baseline whose weights are drawn."""
-    if name in zoo.list():
-        return load_frozen(f"zoo:{name}")
+    """One of the zoo, or one whose weights are drawn."""
+    if name.startswith("zoo:"):
+        return load_frozen(name)
     torch.manual_seed(0)
-    model = build_model(name, **({"sigmas_um": (0.1, 0.3)} if name in ("affine-mtf", "linear") else {}))
+    model = build_model(name, **SETTINGS.get(name, {}))
     for weights in model.parameters():
         weights.data += 0.01 * torch.rand(weights.shape)
     return load_frozen(save_frozen(model, folder / name))
@@ -39,10 +46,10 @@ def frozen(name: str, folder: Path) -> FrozenSimulator:
 @pytest.mark.parametrize(
     "name",
     [
-        "physics",
+        "zoo:physics",
         "pbl",
-        *CLOSED_FORM[:-1],
-        *(pytest.param(n, marks=pytest.mark.long) for n in ("fno", "features")),
+        *CLOSED_FORM,
+        *(pytest.param(f"zoo:{n}", marks=pytest.mark.long) for n in ("pbl", "fno", "features")),
     ],
 )
 def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> None:
@@ -56,7 +63,7 @@ def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> No
 
 
 # The blurs of the others are those of Physics.
-@pytest.mark.parametrize("name", ["physics", "pbl"])
+@pytest.mark.parametrize("name", ["zoo:physics", "pbl", pytest.param("zoo:pbl", marks=pytest.mark.long)])
 def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
     model = frozen(name, tmp_path)

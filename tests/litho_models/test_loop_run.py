@@ -33,7 +33,7 @@ from litho_models.loop.report import effect_text, measurement_text, verdict_text
 from litho_models.loop.results import _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, dealt
 from litho_models.loop.saving import save_model
-from litho_models.scan_terms import measurement
+from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_units
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
@@ -78,7 +78,7 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
         patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
         patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
-        patch.setattr(measurement, "_OFFERS", FEW_OFFERS)
+        patch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
         # Of one blur and two numbers.
         patch.setattr(bases, "build_model", lambda *name, **facts: base_model())
         result = close_loop(store, out, base=BASE, folds=2, open_lock_box=True, report=said.append)
@@ -343,7 +343,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("LAWS", "TABLES"):
         monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
-    monkeypatch.setattr(measurement, "_OFFERS", FEW_OFFERS)
+    monkeypatch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
 
 
 def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(quick: None, tmp_path: Path) -> None:

@@ -160,6 +160,10 @@ def test_the_reason_says_what_is_missing() -> None:
     assert judge(before, before - 10 * signs, STUDY).reason().startswith("better in only 5 of 10")
     assert judge(before, before - 0.1, STUDY).reason() == "gain of 0.10 % is too small to matter"
     assert judge(before, before - 10, STUDY).reason() == ""
+    # Five scans gain 36 and five lose 10: the mean is known to 7, and 13 are gained.
+    torn = judge(before, before - np.array([36.0, -10.0] * 5), STUDY)
+    assert torn.low_nm2 < 0 < torn.gain_nm2
+    assert replace(torn, p=0.0).reason() == "the interval of the held-out gain includes zero"
 
 
 def test_a_gain_matters_by_its_share_or_by_its_size() -> None:

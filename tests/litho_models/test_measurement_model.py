@@ -10,7 +10,8 @@ import pytest
 from numpy.polynomial import legendre
 
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.measurement import LEVELLED, MeasurementModel, SharedPart, learn_measurement
+from litho_models.scan_terms.measurement import LEVELLED, MeasurementModel, SharedPart
+from litho_models.scan_terms.measurement_fit import learn_measurement
 from tests.litho_models.loop_scans import PITCH_UM, blank_scans, with_heights
 
 COUNT, SIZE_PX, NOISE_UM = 8, 48, 0.004

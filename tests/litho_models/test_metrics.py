@@ -9,7 +9,12 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.errors import InputError
 from litho_models.scan_terms import POLICIES, cross_fit
 from litho_models.scoring.metrics import print_gain, scan_errors
-from litho_models.scoring.statistics import bootstrap_interval, over_units, smallest_flip_p
+from litho_models.scoring.statistics import (
+    FEWEST_FOR_INTERVAL,
+    bootstrap_interval,
+    over_units,
+    smallest_flip_p,
+)
 
 VALID = np.ones((256, 256), bool)
 
@@ -83,6 +88,12 @@ def test_interval_over_scans_covers_the_mean_about_as_often_as_promised():
 
 def test_one_scan_has_no_interval():
     assert all(np.isnan(end) for end in bootstrap_interval([20.0]))
+
+
+def test_few_units_have_no_interval_and_enough_have_theirs():
+    values = [1.0] * FEWEST_FOR_INTERVAL
+    assert over_units(values).ci95_nm == (1.0, 1.0)
+    assert over_units(values[1:]).ci95_nm is None
 
 
 def test_sign_flip_p_of_a_uniform_improvement_is_two_in_two_to_the_n():

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -42,7 +44,7 @@ from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
 from litho_models.planning.deciding import MICROSCOPE, NONE, PRINTER, Judge, compared, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
-from litho_models.planning.open_questions import _owners, _question
+from litho_models.planning.open_questions import _Asking, _owners, _question
 from litho_models.planning.questions import (
     NoiseSpectrum,
     OpenQuestions,
@@ -57,7 +59,7 @@ from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
-from litho_models.scan_terms import measurement
+from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
@@ -447,7 +449,7 @@ def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "TABLES", {})
     # That scans share more has its own tests.
-    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))
+    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
 
 
 @pytest.mark.slow
@@ -663,6 +665,20 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
     assert squares(twins[1], alone) > 1.02 * best
     # A fit ends once a step gains less than 0.05 % of the loss.
     assert other == pytest.approx(best, rel=1e-3)
+
+
+def test_what_the_prints_know_is_that_of_all_their_pixels_whatever_the_sample() -> None:
+    name = "slope-thinning"
+    scans = prepare_scans(planted([(name, ALL, {"": SLOPE[name]})], count=4))
+    few = [replace(scan, sample=scan.sample[::4], height=scan.height[::4]) for scan in scans]
+    known = []
+    for study in (scans, few):
+        asking = SimpleNamespace(
+            study=SimpleNamespace(windows=study, scans=scans), report=lambda message: None
+        )
+        known += [np.trace(_Asking._rivals(cast(Any, asking), [name], [model(SLOPE)])[0].information)]
+    # A quarter of the pixels, drawn evenly: a quarter of the sum.
+    assert known[1] == pytest.approx(known[0], rel=0.1)
 
 
 def test_what_is_decided_gets_its_owner_in_the_result() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -10,7 +12,8 @@ from benchmarks import virtual_noise
 from benchmarks.record import published
 from litho_data.virtual_fab.settings import Noise
 from litho_models.noise import NoiseAnalysis
-from litho_models.noise.report import write_noise_report
+from litho_models.noise.calibration import ScanCalibration
+from litho_models.noise.report import _covered, write_noise_report
 from tests.tables import require_tables_equal_record
 
 
@@ -40,3 +43,12 @@ def test_every_column_of_a_table_is_the_field_that_it_names(name: str, tmp_path:
         {},
         pivoted=("calibration.csv", "calibration_scans.csv", "variance.csv"),
     )
+
+
+def test_each_coverage_stands_under_its_level() -> None:
+    scan = ScanCalibration(
+        scan="P11", nll=1.0, crps_nm=2.0, coverage=[0.4, 0.7], standardised_rms=1.1, factor_90=1.2
+    )
+    stated = SimpleNamespace(name="constant", levels=[0.5, 0.9])
+    (row,) = _covered(cast(Any, stated), [scan])
+    assert (row["σ"], row["coverage_50"], row["coverage_90"]) == ("constant", 0.4, 0.7)

@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, get_effect, register_effect
 from litho_models.loop import closing
 from litho_models.loop.record import CloseLoop
-from litho_models.scan_terms import SCAN_TERMS, measurement
+from litho_models.scan_terms import SCAN_TERMS, measurement_fit
 from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import write_store
 
@@ -44,7 +44,7 @@ def test_the_example_finds_the_effects_that_it_registers(
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: list(map(get_effect, names)))
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "TABLES", {})
-    monkeypatch.setattr(measurement, "_OFFERS", (("background", 2, False),))
+    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
     monkeypatch.setattr("litho_models.loop.bases.build_model", lambda *_, **__: base_model())
     monkeypatch.setattr("sys.argv", ["own_effect.py", str(store), "--out", str(out)])
     own_effect.main()

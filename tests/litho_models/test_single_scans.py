@@ -14,7 +14,7 @@ from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import ScanFinding
 from litho_models.loop.single_scans import SingleScans
 from litho_models.scan_terms import SCAN_TERMS
-from litho_models.scan_terms.measurement import learn_measurement
+from litho_models.scan_terms.measurement_fit import learn_measurement
 from tests.litho_models.loop_scans import base_model, planted, study_of, with_heights
 
 # Offsets of lines need two blocks of 32 px and a gap as wide on either side of what they are judged on.

@@ -1,0 +1,63 @@
+"""What a command says about its time: within a factor of two of what follows, whoever does the work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from litho_data.commands import progress as module
+from litho_data.commands.progress import progress, say_estimate
+
+# Items, how many at once, seconds of each and of the start of the workers.
+WORK = {
+    "one by one": (40, 1, 4.0, 0.0),
+    "short ones": (20_000, 1, 0.01, 0.0),
+    "short ones after a long start": (20_000, 2, 0.02, 8.0),
+    "by eight": (100, 8, 10.0, 3.0),
+    "by eight, once and a half": (12, 8, 200.0, 3.0),
+    "few long ones": (3, 1, 100.0, 0.0),
+}
+
+
+class Clock:
+    """A clock that work moves on."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+@pytest.mark.parametrize("work", WORK)
+def test_an_estimate_is_within_a_factor_of_two(
+    work: str, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, at_once, each_s, start_s = WORK[work]
+    said: list[tuple[float, float]] = []
+    monkeypatch.setattr(module, "say_estimate", lambda what, left_s: said.append((left_s, clock.now_s)))
+
+    def results() -> Iterator[int]:
+        began_s = clock.now_s + start_s
+        for number in range(count):
+            clock.now_s = began_s + (number // at_once + 1) * each_s
+            yield number
+
+    assert list(progress(results(), work, count, at_once=at_once)) == list(range(count))
+    ((estimated_s, told_s),) = said
+    assert 0.5 <= estimated_s / (clock.now_s - told_s) <= 2
+
+
+def test_what_takes_less_than_a_minute_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
+    for seconds, words in ((59.0, ""), (150.0, "about 2 min"), (9000.0, "about 2.5 h")):
+        say_estimate("it", seconds)
+        assert words in (said := capsys.readouterr().err)
+        assert bool(said) is bool(words)
