@@ -21,9 +21,9 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
-from litho_data.foundation.run_facts import software_record
 from litho_data.making.assemble import Source
 from litho_data.making.build import make_store
+from litho_data.making.jobs import piece_of
 from litho_data.making.operations import OPERATIONS
 from litho_data.making.result import BuildResult
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
@@ -121,20 +121,17 @@ class PairsJob:
     def run(self) -> Piece:
         """The stitched field as a piece."""
         done = OPERATIONS["stitch-pairs"].run(self._params, self.files, {})
-        pitch_um = self.card.layout.pitch_um
-        record = {
-            "id": self.id,
-            "key": self.key(),
-            "use": "dataset",
-            "print": self.print_id,
-            "order": self.order,
-            "columns": {},
-            "steps": [done.step.to_record()],
-            "quality": {"valid_fraction": 1.0},
-            "read": {"pitch_um": [pitch_um, pitch_um]},
-            "software": software_record(),
-        }
-        return Piece(json.loads(json.dumps(record)), done.arrays)
+        return piece_of(
+            [done],
+            id=self.id,
+            key=self.key(),
+            use="dataset",
+            print=self.print_id,
+            order=self.order,
+            columns={},
+            quality={"valid_fraction": 1.0},
+            read={"pitch_um": [self.card.layout.pitch_um] * 2},
+        )
 
     @property
     def _params(self) -> dict[str, Any]:

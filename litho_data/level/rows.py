@@ -80,15 +80,30 @@ def align_rows(
     Raises:
         InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
     """
-    if method == "facet-tilt" and pitch_um is None:
-        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
-    if direction == "vertical":
-        columns = None if chosen is None else np.ascontiguousarray(chosen.T)
-        pitch = None if pitch_um is None else (pitch_um[1], pitch_um[0])
-        removed = _removed(np.ascontiguousarray(z.T), columns, masking, method, degree, trim, pitch).T
-    else:
-        removed = _removed(z, chosen, masking, method, degree, trim, pitch_um)
-    return subtract(z, removed)
+    upright = direction == "horizontal"
+    lines, usable = z, chosen
+    if not upright:
+        lines, usable = np.ascontiguousarray(z.T), None if chosen is None else np.ascontiguousarray(chosen.T)
+    trim = {"median": MEDIAN_TRIM, "median-of-differences": MEDIAN_TRIM, "polynomial": 0.0}.get(method, trim)
+    match method:
+        case "facet-tilt":
+            if pitch_um is None:
+                raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
+            slopes = row_facet_tilt(lines, usable, pitch_um[1 if upright else 0])
+            removed = np.multiply.outer(slopes, _centred(lines.shape[1]))
+        case "polynomial" if degree > 0:
+            removed = _row_polynomials(lines, usable, degree)
+        case "matching":
+            removed = _matching_shifts(lines, usable, last_column_counts=masking == "include")
+        case "median-of-differences" | "trimmed-mean-of-differences":
+            removed = _difference_shifts(lines, usable, trim)
+        case "modus":
+            removed = _level_shifts(row_modus(lines, usable), lines, usable, fewest=1)
+        case _:
+            means = row_trimmed_mean(lines, usable, trim)
+            removed = _level_shifts(means, lines, usable, fewest_for_row(lines.shape[1]))
+    removed = np.broadcast_to(removed if removed.ndim == 2 else removed[:, None], lines.shape)
+    return subtract(z, removed if upright else removed.T)
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
@@ -112,57 +127,12 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
     return f"{shifted} did not move: part of the print may be removed"
 
 
-def _removed(
-    z: Array,
-    chosen: Array | None,
-    masking: Masking,
-    method: RowMethod,
-    degree: int,
-    trim: float,
-    pitch_um: YX | None,
-) -> Array:
-    if method == "polynomial" and degree > 0:
-        return _row_polynomials(z, chosen, degree)
-    if method == "facet-tilt":
-        assert pitch_um is not None
-        slopes = row_facet_tilt(z, chosen, pitch_um[1])
-        return np.multiply.outer(slopes, _centred(z.shape[1]))
-    match method:
-        case "median":
-            shifts = _level_shifts(z, chosen, MEDIAN_TRIM)
-        case "trimmed-mean":
-            shifts = _level_shifts(z, chosen, trim)
-        case "polynomial":
-            shifts = _level_shifts(z, chosen, 0.0)
-        case "modus":
-            shifts = _modus_shifts(z, chosen)
-        case "median-of-differences":
-            shifts = _difference_shifts(z, chosen, MEDIAN_TRIM)
-        case "trimmed-mean-of-differences":
-            shifts = _difference_shifts(z, chosen, trim)
-        case _:
-            shifts = _matching_shifts(z, chosen, last_column_counts=masking == "include")
-    return np.broadcast_to(shifts[:, None], z.shape)
-
-
-def _level_shifts(z: Array, chosen: Array | None, trim: float) -> Array:
-    shifts = row_trimmed_mean(z, chosen, trim)
+def _level_shifts(shifts: Array, z: Array, chosen: Array | None, fewest: int) -> Array:
+    """The statistics of the rows, that of the whole in the place of those from too few pixels, mean zero."""
     if chosen is not None:
-        too_few = row_counts(z, chosen) < fewest_for_row(z.shape[1])
-        shifts[too_few] = _overall_median(z, chosen)
+        values = z[chosen]
+        shifts[row_counts(z, chosen) < fewest] = np.partition(values, values.size // 2)[values.size // 2]
     return shifts - shifts.mean()
-
-
-def _modus_shifts(z: Array, chosen: Array | None) -> Array:
-    shifts = row_modus(z, chosen)
-    if chosen is not None:
-        shifts[row_counts(z, chosen) == 0] = _overall_median(z, chosen)
-    return shifts - shifts.mean()
-
-
-def _overall_median(z: Array, chosen: Array) -> float:
-    values = z[chosen]
-    return float(np.partition(values, values.size // 2)[values.size // 2])
 
 
 def _difference_shifts(z: Array, chosen: Array | None, trim: float) -> Array:

@@ -14,7 +14,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.making.jobs import Job
 from litho_data.making.operations import READERS, no_recipe
 from litho_data.store.partial import outputs_of
-from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_facts, dataset_sha256
 from litho_data.store.write import SHOWN, consolidate, write_samples, write_table
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def assemble(
     files = files_table(source, {record["id"]: record for record in records}, skipped)
     write_table(root, "manifest", files, "file", {**manifest, "build": dict(build)})
     sha256 = dataset_sha256(
-        dataset_facts(source.card), [_identity(record) for record in records_of_use(records)]
+        facts_of_card(source.card), [_identity(record) for record in records_of_use(records)]
     )
     manifest_sha256 = record_sha256([manifest, table_sha256(files)])
     images = {"labels": [f"../scans/{record['id']}" for record in records]}
@@ -88,23 +88,10 @@ def records_of_use(records: Sequence[Record]) -> list[Record]:
     return [record for record in records if record["use"] == "dataset"]
 
 
-def dataset_facts(card: Card) -> dict[str, Any]:
+def facts_of_card(card: Card) -> dict[str, Any]:
     """What a card says about all scans, as part of the dataset's hash."""
-    layout = card.layout
-    facts: dict[str, Any] = {
-        name: getattr(layout, name) for name in ("pitch_um", "level_height_um", "levels")
-    }
-    if card.scan.instrument != "afm":
-        facts["instrument"] = card.scan.instrument
-    write = card.write.model_dump(exclude_none=True) if card.write else {}
-    return {**facts, "write": write} if write else facts
-
-
-def flat_facts(card: Card) -> dict[str, Any]:
-    """The same, without a table in it: its keys are those of ``WRITE``."""
-    facts = dataset_facts(card)
-    written = facts.pop("write", {})
-    return facts | {f"{WRITE}{key}": value for key, value in written.items()}
+    write = card.write.model_dump(exclude_none=True) if card.write else None
+    return dataset_facts(card.layout, card.scan.instrument, write)
 
 
 def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
@@ -113,6 +100,9 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
     Numbers and words only, which any format can hold.
     """
     card = Card.model_validate(manifest["card"])
+    facts = facts_of_card(card)
+    # The keys of a table are those of ``WRITE``.
+    written = {f"{WRITE}{key}": value for key, value in facts.pop("write", {}).items()}
     operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
     return {
         "Conventions": "CF-1.11",
@@ -121,7 +111,8 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
         "title": card.title,
         "license": card.license,
         "citation": card.citation,
-        **flat_facts(card),
+        **facts,
+        **written,
         # Tools for OME-Zarr look for images under the names in this list; a word of one letter is one name.
         "labels": IMAGES,
         "assumptions": "; ".join(manifest["assumptions"]),

@@ -51,6 +51,13 @@ class Skipped:
     reason: str
 
 
+def piece_of(steps: Sequence[Done], **said: Any) -> Piece:
+    """The piece that these steps made, with what else its record says."""
+    record = {**said, "steps": [done.step.to_record() for done in steps], "software": software_record()}
+    arrays = {name: array for done in steps for name, array in done.arrays.items()}
+    return Piece(json.loads(json.dumps(record)), arrays)
+
+
 def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
     """Run a job and keep its piece, whose record is returned: arrays stay where they are made.
 
@@ -149,21 +156,19 @@ class FieldJob:
             quality["removed_sd_nm"] = float(np.nanstd(removed_nm))
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
-        record = {
-            "id": self.id,
-            "key": self.key(),
-            "use": self.field.use,
-            "print": self.field.print_id,
-            "order": self.field.order,
-            "columns": dict(self.field.columns),
-            "steps": [done.step.to_record() for done in steps],
-            "quality": quality,
-            "notes": notes,
-            "read": read,
-            "pitch_um": scaled_pitch_um(read["pitch_um"], facts.get("calibrate", {})),
-            "software": software_record(),
-        }
-        return Piece(json.loads(json.dumps(record)), arrays)
+        return piece_of(
+            steps,
+            id=self.id,
+            key=self.key(),
+            use=self.field.use,
+            print=self.field.print_id,
+            order=self.field.order,
+            columns=dict(self.field.columns),
+            quality=quality,
+            notes=notes,
+            read=read,
+            pitch_um=scaled_pitch_um(read["pitch_um"], facts.get("calibrate", {})),
+        )
 
     def _steps(self) -> Iterator[Done]:
         """The operations in order; each takes what it needs of the arrays of those before it."""

@@ -17,6 +17,7 @@ from litho_data.readers.reader import (
     Reader,
     extent_um,
     foreign_parser,
+    in_memory,
     one_by_one,
 )
 
@@ -49,7 +50,7 @@ def read_channels(path: Path) -> list[Channel]:
         if file.attrs.get("file-format-info") == _JPK:
             channels = [channel for name in sorted(file) for channel in _jpk_channels(path, file[name])]
         elif "topostats_file_version" in file:
-            channels = [_topostats_channel(path, file, name) for name in _TOPOSTATS_IMAGES if name in file]
+            channels = [_topostats_channel(file, name) for name in _TOPOSTATS_IMAGES if name in file]
         elif _NANOSURF in file.attrs:
             channels = _nanosurf_channels(path, file)
         elif "MetaData" in file and "Data" in file:  # Zygo's DATX
@@ -156,7 +157,7 @@ def _load_nanosurf(path: Path, name: str, shape: Shape, range_: tuple[float, flo
     return np.where(counts == fill, np.nan, values + range_[0]) if fill else values + range_[0], None
 
 
-def _topostats_channel(path: Path, file: Any, name: str) -> Channel:
+def _topostats_channel(file: Any, name: str) -> Channel:
     nm_per_px = float(file["pixel_to_nm_scaling"][()])
     ny, nx = file[name].shape
     scalars = {key: _text(item[()]) for key, item in file.items() if getattr(item, "shape", None) == ()}
@@ -165,16 +166,9 @@ def _topostats_channel(path: Path, file: Any, name: str) -> Channel:
         shape=(ny, nx),
         unit="nm",
         size_um=(ny * nm_per_px * _UM_PER_NM, nx * nm_per_px * _UM_PER_NM),
-        load=partial(_load_plain, path, name),
+        load=in_memory(np.asarray(file[name][()], dtype=float)),
         header=scalars,
     )
-
-
-def _load_plain(path: Path, name: str) -> Loaded:
-    import h5py
-
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
-        return np.asarray(file[name][()], dtype=float), None
 
 
 def _text(value: Any) -> str:

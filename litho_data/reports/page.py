@@ -212,12 +212,21 @@ def _template() -> jinja2.Template:
 
 def filled(template: Path, **values: object) -> str:
     """A page of text from its template (Jinja) and the values that the template names."""
+    return _plain(template).render(values)
+
+
+def sentences(template: Path, about: str, one: object) -> str:
+    """What a macro of a template says about one thing, in one line."""
+    return " ".join(getattr(_plain(template).module, about)(one).split())
+
+
+def _plain(template: Path) -> jinja2.Template:
     import jinja2
 
     environment = jinja2.Environment(
         trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string(template.read_text(encoding="utf-8")).render(values)
+    return environment.from_string(template.read_text(encoding="utf-8"))
 
 
 def _whole_options(text: str) -> Markup:

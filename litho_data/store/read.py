@@ -43,6 +43,7 @@ from litho_data.store.schema import (
     VARIABLES,
     DatasetId,
     Instrument,
+    dataset_facts,
     dataset_sha256,
 )
 
@@ -237,13 +238,7 @@ class Store:
 
     def computed_sha256(self) -> str:
         """Hash of the dataset from the arrays as they are now."""
-        facts: dict[str, Any] = {
-            name: getattr(self, name) for name in ("pitch_um", "level_height_um", "levels")
-        }
-        if self.instrument != "afm":
-            facts["instrument"] = self.instrument
-        if self.write:
-            facts["write"] = self.write
+        facts = dataset_facts(self, self.instrument, self.write)
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
 
     def _identity(self, row: int) -> dict[str, Any]:

@@ -97,12 +97,22 @@ TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
 
 
+def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What holds for all scans, as part of the dataset's hash.
+
+    Args:
+        geometry: has ``pitch_um``, ``level_height_um`` and ``levels``; ``write``: the card's table.
+    """
+    facts = {name: getattr(geometry, name) for name in ("pitch_um", "level_height_um", "levels")}
+    kind = {} if instrument == "afm" else {"instrument": instrument}
+    return {**facts, **kind, **({"write": dict(write)} if write else {})}
+
+
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
     """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
 
     Args:
-        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, if known, the ``write`` table; the
-            ``instrument`` if it is no AFM.
+        facts: see ``dataset_facts``.
         scans: per scan in stored order: ``id``, ``print``, ``order``, the optional columns that are not NaN,
             and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
     """

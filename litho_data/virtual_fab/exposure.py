@@ -113,28 +113,12 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
     """
     written = np.zeros_like(nominal)
     ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
-    for index in np.ndindex(offset_px.shape[:2]):
-        whole = np.floor(offset_px[index]).astype(int)
-        share = offset_px[index] - whole
-        for step in np.ndindex(2, 2):
-            weight = float(np.prod(np.where(step, share, 1 - share)))
-            to, of = zip(
-                *(
-                    _overlap(first[i], last[i], by, size)
-                    for first, last, i, by, size in zip(
-                        starts, ends, index, whole + step, nominal.shape, strict=True
-                    )
-                ),
-                strict=True,
-            )
-            written[to] += weight * nominal[of]
+    for row, column in np.ndindex(offset_px.shape[:2]):
+        field = slice(starts[0][row], ends[0][row]), slice(starts[1][column], ends[1][column])
+        alone = np.zeros_like(nominal)
+        alone[field] = nominal[field]
+        written += scipy.ndimage.shift(alone, offset_px[row, column], order=1, mode="grid-constant")
     return written
-
-
-def _overlap(start: int, stop: int, by: int, size: int) -> tuple[slice, slice]:
-    """Where pixels from ``start`` to ``stop`` come to lie within ``size``, and which of them do."""
-    low, high = min(max(start + by, 0), size), max(min(stop + by, size), 0)
-    return slice(low, high), slice(low - by, high - by)
 
 
 def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:

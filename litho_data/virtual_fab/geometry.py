@@ -77,10 +77,6 @@ def sample_surface(
     """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
-    warped = knobs.any("piezo-nonlinearity", "registration-residual")
-    if not warped and (corner := _whole_pixel_corner(frame)) is not None:
-        top, left = corner
-        return surface[top : top + frame.shape[0], left : left + frame.shape[1]].copy()
     # On the way back a piezo bulges the other way.
     if strength := direction * knobs["piezo-nonlinearity"]:
         x_um = x_um + strength * x_um * (1 - x_um / frame.size_um[1])
@@ -94,17 +90,6 @@ def sample_surface(
     rows = layout_y_um / frame.layout_pitch_um - 0.5 + GUARD_PX
     columns = layout_x_um / frame.layout_pitch_um - 0.5 + GUARD_PX
     return scipy.ndimage.map_coordinates(surface, [rows, columns], order=3, mode="nearest")
-
-
-def _whole_pixel_corner(frame: ScanFrame) -> tuple[int, int] | None:
-    """(row, column) on the canvas of the scan's first pixel if the frames differ by whole pixels only."""
-    shift_px = frame.scan_to_layout[:2, 2] / frame.pitch_um
-    whole = np.round(shift_px)
-    if frame.pitch_um != frame.layout_pitch_um:
-        return None
-    if not np.array_equal(frame.scan_to_layout[:2, :2], np.eye(2)) or np.abs(shift_px - whole).max() > 1e-9:
-        return None
-    return int(whole[1]) + GUARD_PX, int(whole[0]) + GUARD_PX
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:

@@ -22,6 +22,8 @@ from litho_data.virtual_fab.settings import Printer
 SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
+# Cut-offs of random layouts, taken in turn by the prints.
+_CUTOFFS_PER_UM = (0.25, 0.5)
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,6 @@ class Plan:
         count: number of fields.
         size_px: (ny, nx) of a layout.
         fields_per_print: fields of one print block.
-        cutoffs_per_um: cut-offs of the layouts, taken in turn by the prints, cycles/µm.
         write_field_um: side of a write field shared by all fields of a print; None gives each
             field its own write field, centred on it.
         references: add a bare substrate, a flat print and a five-step print (print 0).
@@ -41,15 +42,14 @@ class Plan:
     count: int = 12
     size_px: Shape = (256, 256)
     fields_per_print: int = 4
-    cutoffs_per_um: tuple[float, ...] = (0.25, 0.5)
     write_field_um: float | None = None
     references: bool = False
 
     def __post_init__(self) -> None:
-        if self.count < 1 or self.fields_per_print < 1 or not self.cutoffs_per_um:
+        if self.count < 1 or self.fields_per_print < 1:
             raise InputError(
                 "plan of a virtual-fab run",
-                got=f"{self.count} fields, {self.fields_per_print} a print, cut-offs {self.cutoffs_per_um}",
+                got=f"{self.count} fields, {self.fields_per_print} a print",
                 wanted="at least one of each",
             )
         if min(self.size_px) < 32:
@@ -75,7 +75,7 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
             level=random_layout(
                 plan.size_px,
                 levels=printer.levels,
-                cutoff_per_um=plan.cutoffs_per_um[block % len(plan.cutoffs_per_um)],
+                cutoff_per_um=_CUTOFFS_PER_UM[block % len(_CUTOFFS_PER_UM)],
                 pitch_um=printer.pitch_um,
                 seed=np.random.SeedSequence(seed, spawn_key=(index, 0)),
             ),

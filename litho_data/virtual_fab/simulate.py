@@ -39,7 +39,6 @@ def simulate(
     microscope: Microscope | str = "default",
     printer: Printer | None = None,
     fields_per_print: int = 4,
-    cutoffs_per_um: Sequence[float] = (0.25, 0.5),
     write_field_um: float | None = None,
     references: bool = False,
     jobs: Sequence[Job] | None = None,
@@ -63,7 +62,6 @@ def simulate(
         noise: ``default``, ``off``, or own standard deviations.
         microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or own values.
         fields_per_print: fields that share a print block.
-        cutoffs_per_um: cut-offs of the random layouts, taken in turn by the prints, cycles/µm.
         write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
         references: add scans of a bare substrate, a flat print and a five-step print.
         jobs: your own layouts instead of random ones; the arguments about random layouts are then unused.
@@ -96,7 +94,7 @@ def simulate(
         cause=cause,
     )
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px
-    plan = Plan(count, shape, fields_per_print, tuple(cutoffs_per_um), write_field_um, references)
+    plan = Plan(count, shape, fields_per_print, write_field_um, references)
     if jobs is not None:
         _check_jobs(jobs, fab.printer)
     source: Iterator[Job] = iter(jobs) if jobs is not None else random_jobs(plan, fab.printer, seed)

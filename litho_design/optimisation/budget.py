@@ -18,19 +18,22 @@ _KIB_PER_GIB = 1 << 20
 
 
 class Budget(Record):
-    """Cost of one iteration, measured on a trial iteration that changes nothing."""
+    """Cost of one iteration, measured on a trial iteration that changes nothing.
+
+    ``seconds_after``: of what comes after the search, scores and report.
+    """
 
     seconds_per_iteration: float
     seconds_per_evaluation: float
     peak_memory_gib: float
+    seconds_after: float = 0.0
 
     def total_seconds(self, search: SearchSettings, done: int = 0) -> float:
-        """Expected time of the search after ``done`` iterations, and of its polish."""
+        """Expected time of the search after ``done`` iterations, of its polish, and of what comes after."""
         left = search.iterations - done
         evaluations = left / search.evaluate_every
-        return (
-            left + search.polish_rounds
-        ) * self.seconds_per_iteration + evaluations * self.seconds_per_evaluation
+        searched = (left + search.polish_rounds) * self.seconds_per_iteration
+        return searched + evaluations * self.seconds_per_evaluation + self.seconds_after
 
     def sentence(self, search: SearchSettings, done: int = 0) -> str:
         """The estimate in one line, for the iterations left after ``done``."""
@@ -38,7 +41,7 @@ class Budget(Record):
         what = f"{search.iterations - done} more iterations" if done else f"{search.iterations} iterations"
         return (
             f"estimate: {what} of {self.seconds_per_iteration:.2f} s, "
-            f"about {minutes:.1f} min; peak memory {self.peak_memory_gib:.2f} GiB"
+            f"about {minutes:.1f} min with scores and page; peak memory {self.peak_memory_gib:.2f} GiB"
         )
 
 
@@ -52,12 +55,12 @@ def measure_budget(
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()
-    loss, _ = objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+    loss, _ = objective(parameters.sample(search.temperature(0), seed=0))
     loss.backward()
     _wait(device)
     middle = clock()
     with torch.no_grad():
-        objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+        objective(parameters.sample(search.temperature(0), seed=0))
     _wait(device)
     for parameter in parameters.parameters():
         parameter.grad = None

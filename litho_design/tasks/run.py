@@ -25,6 +25,8 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED
 
+# Layouts that every model prints: the searched one, and that of doing nothing. Seconds that a page takes.
+_CANDIDATES, _PAGE_S = 2, 7.0
 # Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 
@@ -141,6 +143,9 @@ def _search(
         start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
     budget = measure_budget(parameters, task.objective, search)
     if announce:
+        if task.reported:
+            after = _seconds_after(task, parameters.cells(parameters.best_levels()))
+            budget = budget.model_copy(update={"seconds_after": after})
         for line in (*task.notes, budget.sentence(search, done)):
             print(line, file=sys.stderr)
     state = search_layout(
@@ -156,3 +161,16 @@ def _search(
         loss = losses[-1]
     seconds = state.earlier_seconds + time.monotonic() - started
     return _Found(levels, start_loss, loss), state, budget, seconds
+
+
+@torch.no_grad()
+def _seconds_after(task: Task, level: Tensor) -> float:
+    """What choice, scores and yield will take, from one print by each model and one draw of the yield."""
+    models = (*task.printers, *task.judges)
+    started = time.perf_counter()
+    heights = [one(level[None, None].float())[0, 0] for one in models]
+    printed = time.perf_counter()
+    task.window_scores(heights[0], 1)
+    per_score = time.perf_counter() - printed
+    scores = task.settings.window.yield_draws + _CANDIDATES * len(models)
+    return _CANDIDATES * (printed - started) + scores * per_score + _PAGE_S

@@ -51,7 +51,7 @@ def close_loop(
 
     Example: litho-models close-loop prints.zarr --out loop
     """
-    from litho_models.loop.report import decision_text, effect_text, verdict_text
+    from litho_models.loop.report import said
 
     result = litho_models.close_loop(
         stores[0],
@@ -69,11 +69,11 @@ def close_loop(
         dask=dask,
         report=lambda message: typer.echo(message, err=True),
     )
-    typer.echo(verdict_text(result))
+    typer.echo(said("verdict", result))
     for one in result.effects:
-        typer.echo(f"  {effect_text(one)}")
+        typer.echo("  " + said("effect", one))
     for decision in result.decisions:
-        typer.echo(f"  {decision_text(decision)}")
+        typer.echo("  " + said("decision", decision))
     typer.echo(f"report: {out / 'report.html'}")
 
 

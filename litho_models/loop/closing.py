@@ -10,6 +10,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from torch import nn
@@ -19,17 +20,14 @@ from litho_models.effects import Effect, screened_effects
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.checking import Check, Checked
-from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
+from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, held_out_maps
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.prepared import PreparedScan, prepare_scans, prepared_among
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.measurement_fit import learn_measurement
-
-# A law is a short formula: two terms at most.
-MOST_LAWS, MOST_TABLES = 2, 2
 
 
 @dataclass(frozen=True)
@@ -112,19 +110,25 @@ def close(
 
     @cache
     def learner() -> Learner:
-        return Learner(at_work, held_out_maps(start, at_work, at_work.scans))
+        return Learner(at_work, held_out_maps(start.per_fold, at_work, at_work.scans))
 
     excluded = untestable(at_work)
     causes = [one for one in screened_effects(at_work.tip_radius_um) if one.name not in excluded]
     chosen = _chosen(start, at_work, causes, learner)
-    stages = {"base": start, "causes": chosen.named.state, "laws": chosen.lawful.state}
+    # By the model, so that a stage that changes nothing counts with the one before it.
+    stages: dict[State, str] = {start: "base"}
+    stages.setdefault(chosen.named.state, "causes")
+    stages.setdefault(chosen.lawful.state, "laws")
     return Closed(
         study=at_work,
         original=original,
         plain=first,
         base=start,
         chosen=chosen,
-        rests=_rests(stages, at_work, learner()),
+        rests={
+            name: learner().rest(held_out_maps(state.per_fold, at_work, at_work.scans))
+            for state, name in stages.items()
+        },
         untestable=excluded,
     )
 
@@ -142,13 +146,14 @@ def _chosen(
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
-        lawful = search(named.state, study, laws, MOST_LAWS, secants)
+        # Two terms at most, so that a law is a short formula.
+        lawful = search(named.state, study, laws, 2, secants)
         study.report("describing what is left")
-        described = describe(lawful.state, study, tables, MOST_TABLES, secants)
+        described = describe(lawful.state, study, tables, 2, secants)
         if not named.causes:
             return Chosen(named, failed, lawful, described)
         in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
-        left_nm2 = learner().rest(held_out_maps(in_place, study, study.scans)).mean_nm2
+        left_nm2 = learner().rest(held_out_maps(in_place.per_fold, study, study.scans)).mean_nm2
         check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
         checked = [check.of(cause) for cause in named.causes]
         named.causes = [one.cause for one in checked]
@@ -178,10 +183,21 @@ def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: floa
     return fit_state(state.twin.with_effect(table.name, table.by, table.values), study, from_here=True)
 
 
-def held_out_maps(state: State, study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-    """Predicted prints (y, x), µm, each by the fit that has not seen the scan."""
-    placed = [state.twin.at(vector).placed() for vector in state.per_fold]
-    return [placed[fold].height(scan, int(fold)) for fold, scan in zip(study.fold_of, scans, strict=True)]
+class Fit(NamedTuple):
+    """Printer and measurement fitted to the same scans."""
+
+    twin: Twin
+    measurement: MeasurementModel
+
+    @property
+    def numbers(self) -> tuple[int, int]:
+        """Fitted numbers of printer and measurement."""
+        return len(self.twin.vector), self.measurement.numbers
+
+    def expected_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+        """Maps (y, x) that the scans should show."""
+        placed = self.twin.placed()
+        return [self.measurement.expected_um(scan.stored, placed.height(scan)) for scan in scans]
 
 
 def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> list[PrintedScan]:
@@ -189,7 +205,7 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
 
     What all scans share stays in: a cause may have it. A scan is freed by what was learned without its fold.
     """
-    maps = held_out_maps(state, study, study.scans)
+    maps = held_out_maps(state.per_fold, study, study.scans)
     freed = list(scans)
     for fold in study.folds:
         own = np.flatnonzero(study.fold_of != fold).tolist()
@@ -202,36 +218,24 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
     return freed
 
 
-def fit_with_measurement(
-    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, fold: int | None = None, refit: bool = True
-) -> tuple[Twin, MeasurementModel]:
+def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
     """Printer and measurement fitted to the same scans, one after the other and once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
-        fold: that a base which was trained without each fold must not have seen.
         refit: the printer, once the measurement is known; or leave it where it is.
     """
     stored = [scan.stored for scan in scans]
-    placed = twin.placed()
-    maps = [placed.height(scan, fold) for scan in scans]
-    learned = learn_measurement(stored, maps, seed=seed)
-    if refit and len(twin.vector):
-        freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
-        windows = [scan.window for scan in prepared_among(freed, scans)]
-        twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)
+
+    def learned() -> tuple[MeasurementModel, list[np.ndarray]]:
         placed = twin.placed()
-        learned = learn_measurement(stored, [placed.height(scan, fold) for scan in scans], seed=seed)
-    return twin, learned
+        maps = [placed.height(scan) for scan in scans]
+        return learn_measurement(stored, maps, seed=seed), maps
 
-
-def _rests(stages: dict[str, State], study: Study, learner: Learner) -> dict[str, Rest]:
-    """What could still be learned beside each stage that changes the model."""
-    rests: dict[str, Rest] = {}
-    seen: list[State] = []
-    for name, state in stages.items():
-        if any(state is other for other in seen):
-            continue
-        seen.append(state)
-        rests[name] = learner.rest(held_out_maps(state, study, study.scans))
-    return rests
+    measurement, maps = learned()
+    if refit and len(twin.vector):
+        freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
+        windows = [scan.window for scan in prepared_among(freed, scans)]
+        twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        measurement, _ = learned()
+    return Fit(twin, measurement)

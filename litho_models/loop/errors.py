@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any
 
 import numpy as np
 from torch import nn
@@ -11,36 +12,35 @@ from torch import nn
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
-from litho_models.loop.closing import Closed, fit_with_measurement, held_out_maps
-from litho_models.loop.fits import State, Study, fit_state, prepared_among
+from litho_models.loop.closing import Closed, Fit, fit_with_measurement
+from litho_models.loop.fits import State, Study, fit_state, held_out_maps
 from litho_models.loop.judging import judge
 from litho_models.loop.model import Twin, is_refitted
-from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.record import ErrorRow, MeasuredBy, Stage, error_of
+from litho_models.loop.prepared import PreparedScan, prepared_among
+from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.grouped import ALL
-from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
-# Of the smooth background of the published protocol.
-_PUBLISHED_NUMBERS = 5
 Maps = list[np.ndarray]
 
 
 def error_rows(
     scans: Sequence[PrintedScan],
     maps_um: Sequence[np.ndarray],
-    *,
-    model: Stage,
-    measurement: MeasuredBy,
-    held_out: Any,
     numbers: tuple[int, int],
     seed: int = 0,
+    **terms: Any,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy."""
+    """Errors of maps (y, x) µm under each reported policy.
+
+    Args:
+        numbers: fitted numbers of printer and measurement; ``terms``: model, measurement and held_out of
+            ``ErrorRow``.
+    """
     rows = []
     for policy in REPORTED:
         fits = [
@@ -51,11 +51,9 @@ def error_rows(
         mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
         rows.append(
             ErrorRow(
-                model=model,
-                measurement=measurement,
+                **terms,
                 policy=policy,
                 k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
-                held_out=held_out,
                 printer_numbers=numbers[0],
                 measurement_numbers=numbers[1],
                 mae_nm=float(np.mean(mae)),
@@ -65,18 +63,6 @@ def error_rows(
             )
         )
     return rows
-
-
-class Fit(NamedTuple):
-    """Printer and measurement fitted to the same scans."""
-
-    twin: Twin
-    measurement: MeasurementModel
-
-    @property
-    def numbers(self) -> tuple[int, int]:
-        """Fitted numbers of printer and measurement."""
-        return len(self.twin.vector), self.measurement.numbers
 
 
 class HeldOut:
@@ -89,144 +75,125 @@ class HeldOut:
     def __init__(self, closed: Closed, settings: Study):
         self.closed, self.settings = closed, settings
         self.scans = [one.stored for one in closed.original]
-        # With its state, which must outlive its entry: the number of one that is gone may come again.
-        self._known: dict[tuple[int, bool], tuple[State, tuple[Maps, tuple[int, int]]]] = {}
-
-    @property
-    def stages(self) -> dict[Stage, State]:
-        """The models in order, each once."""
-        found: dict[Stage, State] = {"base": self.closed.base}
-        if self.closed.causes and self.closed.chosen.lawful.causes:
-            found["causes"] = self.closed.chosen.named.state
-        return {**found, "all": self.closed.final}
+        # Base and corrected model, and the one between them if there are causes and laws.
+        self.ends: dict[Stage, State] = {"base": closed.base, "all": closed.final}
+        causes: dict[Stage, State] = {"causes": closed.chosen.named.state}
+        between = causes if closed.causes and closed.chosen.lawful.causes else {}
+        self.stages = {"base": closed.base, **between, **self.ends}
+        self._by_fold = cache(self._without_folds)
 
     def errors(self) -> list[ErrorRow]:
         """Of all models, scans predicted without their fold; of first and last also without their print."""
-        plain, study = self.closed.plain, self.closed.study
+        plain = self.closed.plain
         numbers = len(plain.twin.vector)
-        maps = held_out_maps(plain, study, self.closed.original)
-        rows = self._rows("base", "print alone", "scans", maps, (numbers, 0))
-        published = self._published(plain, maps)
-        rows += self._rows("base", "published", "scans", published, (numbers, _PUBLISHED_NUMBERS))
+        maps = held_out_maps(plain.per_fold, self.settings, self.closed.original)
+        rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
+        # A smooth background has five numbers.
+        rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
         for name, state in self.stages.items():
             self.settings.report("scoring the base" if name == "base" else f"scoring {name}")
-            rows += self._rows(name, "shared", "scans", *self._by_fold(state))
+            rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
         if 1 < len(set(prints)) < len(prints) and is_refitted(self.closed.base.twin.base):
-            for name, state in self._ends():
+            for name, state in self.ends.items():
                 self.settings.report(f"leaving out whole prints: {name}")
-                jobs = dict.fromkeys(sorted(set(prints)), (state.twin, None))
-                rows += self._rows(name, "shared", "prints", *self._without_parts(jobs, prints))
+                starts = dict.fromkeys(sorted(set(prints)), state.twin)
+                rows += self._rows(*self._without_parts(starts, prints), name, held_out="prints")
         return rows
 
-    def of_others(self, scans: Sequence[PrintedScan]) -> list[tuple[Stage, Fit, list[np.ndarray]]]:
-        """Base and corrected model fitted to all scans that took part, and the maps of scans that did not."""
+    def of_others(self, scans: Sequence[PrintedScan]) -> list[tuple[Stage, tuple[int, int], Maps]]:
+        """Numbers of base and corrected model, fitted to all scans that took part; maps of these others."""
         prepared, found = prepared_among(scans, self.closed.original), []
-        for name, state in self._ends():
-            fit = Fit(*fit_with_measurement(state.twin, self.closed.original, self.settings.seed))
-            found.append((name, fit, _expected(fit, prepared, None)))
+        for name, state in self.ends.items():
+            fit = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)
+            found.append((name, fit.numbers, fit.expected_um(prepared)))
         return found
 
-    def maps_um(self, state: State) -> list[np.ndarray]:
+    def maps_um(self, state: State) -> Maps:
         """The maps (y, x) that the scans should show, print and measurement learned without their fold."""
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
+        """By how much the error grows (k = 1) without each cause or law, the rest fitted again.
+
+        The printer is left as it stands, the measurement learned again beside it.
+        """
+
+        def mae_nm(state: State) -> float:
+            rows = self._rows(*self._by_fold(state, refit=False), "all")
+            return next(row.mae_nm for row in rows if row.is_headline)
+
         model, found = self.closed.final, {}
-        whole_nm = self._mae_nm(model) if model.twin.names else 0.0
+        whole_nm = mae_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.settings.report(f"leaving out {name}")
-            found[name] = self._mae_nm(model.without(name, self.closed.study)) - whole_nm
+            found[name] = mae_nm(model.without(name, self.closed.study)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """Residual maps (y, x), nm, of all scans before and after, each with its own zero taken out."""
-        found = []
-        before, after = (self.maps_um(state) for _, state in self._ends())
-        for scan, *maps in zip(self.scans, before, after, strict=True):
-            left = [np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan) for own in maps]
-            found.append((scan.id, left[0] - np.nanmedian(left[0]), left[1] - np.nanmedian(left[1])))
-        return found
+
+        def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
+            left = np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan)
+            return left - np.nanmedian(left)
+
+        maps = map(self.maps_um, self.ends.values())
+        return [
+            (scan.id, left_nm(scan, before), left_nm(scan, after))
+            for scan, before, after in zip(self.scans, *maps, strict=True)
+        ]
 
     def survives_on(self, others: Mapping[str, nn.Module]) -> dict[str, list[str]]:
         """For each cause and law, the other bases on which it is confirmed too, all others in place."""
-        final, study = self.closed.final, self.closed.study
-        found: dict[str, list[str]] = {name: [] for name in final.twin.names}
+        final, study = self.closed.final.twin, self.closed.study
+        found: dict[str, list[str]] = {name: [] for name in final.names}
         for base_name, base in others.items() if found else ():
             self.settings.report(f"trying what was found on {base_name}")
             bare = fit_state(Twin.bare(base, study.scans[0]), study)
-            full = fit_state(final.twin.over(bare.twin.placed().base, study.scans[0]), study)
-            for name, by in final.twin.by.items():
+            full = fit_state(final.over(bare.twin.placed().base, study.scans[0]), study)
+            for name, by in final.by.items():
                 without = full.without(name, study)
                 if judge(without.freed_nm2, full.freed_nm2, study).passed(grouped=by != ALL):
                     found[name].append(base_name)
         return found
 
-    def _ends(self) -> tuple[tuple[Stage, State], ...]:
-        return ("base", self.closed.base), ("all", self.closed.final)
+    def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
+        terms = {"measurement": "shared", "held_out": "scans", **terms}
+        return error_rows(self.scans, maps, numbers, self.settings.seed, model=model, **terms)
 
-    def _mae_nm(self, state: State) -> float:
-        """Mean absolute error, k = 1: the printer as it stands, the measurement learned again beside it."""
-        row = error_of(self._rows("all", "shared", "scans", *self._by_fold(state, refit=False)), "all")
-        assert row is not None
-        return row.mae_nm
-
-    def _rows(
-        self, model: Stage, measurement: MeasuredBy, held_out: Any, maps: Maps, numbers: tuple[int, int]
-    ) -> list[ErrorRow]:
-        return error_rows(
-            self.scans, maps, model=model, measurement=measurement, held_out=held_out, numbers=numbers,
-            seed=self.settings.seed,
-        )  # fmt: skip
-
-    def _by_fold(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
-        key = id(state), refit
-        if key not in self._known:
-            starts = {fold: (state.twin.at(own), fold) for fold, own in enumerate(state.per_fold)}
-            found = self._without_parts(starts, self.settings.fold_of.tolist(), refit)
-            self._known[key] = state, found
-        return self._known[key][1]
+    def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
+        fold_of = self.settings.fold_of.tolist()
+        return self._without_parts(dict(enumerate(state.per_fold)), fold_of, refit)
 
     def _without_parts(
-        self, starts: Mapping[Any, tuple[Twin, int | None]], part_of: Sequence[Any], refit: bool = True
+        self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
         """Maps of all scans by fits without their part, and the most numbers that any of them took.
 
         Args:
-            starts: part to where its fit begins, and the fold that the base must not have seen.
+            starts: part to where its fit begins.
         """
         original, jobs = self.closed.original, []
-        for part, (twin, fold) in starts.items():
+        for part, twin in starts.items():
             rest = [scan for scan, own in zip(original, part_of, strict=True) if own != part]
-            jobs.append((part, twin, rest, self.settings.seed, fold, refit))
+            jobs.append((part, twin, rest, self.settings.seed, refit))
         done = run_jobs(_fit_part, jobs, self.settings.workers, name=lambda job: f"part {job[0]}")
         fits = {job[0]: fit for job, fit in done}
-        maps = [
-            _expected(fits[part], [scan], starts[part][1])[0]
-            for scan, part in zip(original, part_of, strict=True)
-        ]
+        maps = [fits[part].expected_um([scan])[0] for scan, part in zip(original, part_of, strict=True)]
         return maps, max(fit.numbers for fit in fits.values())
 
-    def _published(self, state: State, maps: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def _published(self, maps: Maps) -> Maps:
         """The maps with the smooth background of the training scans: the published protocol."""
         found, fold_of = list(maps), self.settings.fold_of
-        for fold in self.closed.study.folds:
-            placed = state.twin.at(state.per_fold[fold]).placed()
-            own = np.flatnonzero(fold_of != fold).tolist()
+        for fold, twin in enumerate(self.closed.plain.per_fold):
+            placed, own = twin.placed(), np.flatnonzero(fold_of != fold).tolist()
             learned = learn_background(
-                [self.scans[i] for i in own],
-                [placed.height(self.closed.original[i], int(fold)) for i in own],
+                [self.scans[i] for i in own], [placed.height(self.closed.original[i]) for i in own]
             )
             for i in np.flatnonzero(fold_of == fold).tolist():
                 found[i] = Prediction.beside(learned, maps[i]).map_um
         return found
 
 
-def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, int | None, bool]) -> Fit:
-    return Fit(*fit_with_measurement(*job[1:]))
-
-
-def _expected(fit: Fit, scans: Sequence[PreparedScan], fold: int | None) -> list[np.ndarray]:
-    placed = fit.twin.placed()
-    return [fit.measurement.expected_um(scan.stored, placed.height(scan, fold)) for scan in scans]
+def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, bool]) -> Fit:
+    return fit_with_measurement(*job[1:])

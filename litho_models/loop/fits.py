@@ -13,7 +13,6 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import HERE, Workers
-from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
     Linearised,
@@ -25,9 +24,8 @@ from litho_models.fitting.least_squares import (
     solve_damped,
     with_residuals,
 )
-from litho_models.loop.folded_base import FoldedBase
-from litho_models.loop.model import Placed, Twin, exposed, finished
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.model import Placed, Twin
+from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 
@@ -36,10 +34,6 @@ FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
 # What a comparison of errors leaves to the single scans.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
-# The way to the neighbourhood of the optimum is walked on every third scan.
-_START_EVERY = 3
-# A fit without a fold starts at the common one and takes its derivatives.
-_FOLD_STEPS, _FOLD_GAIN, _FOLD_DAMPING = 6, 1e-4, 1e-6
 
 
 def _silent(message: str) -> None:
@@ -87,19 +81,19 @@ class Study:
         return groupings([scan.stored for scan in self.scans])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """A fitted twin.
 
     Attributes:
-        twin: at the numbers fitted to all scans; ``per_fold``: (folds, p), each without its own scans.
+        twin: at the numbers fitted to all scans; ``per_fold``: the same, each fitted without its own scans.
         linear: each window at ``twin``: residual, derivatives, and what the scan may add by itself.
         held_out_um: residual (n,) of each window by the fit that has not seen it.
         freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
     """
 
     twin: Twin
-    per_fold: np.ndarray
+    per_fold: list[Twin]
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_nm2: np.ndarray
@@ -117,70 +111,43 @@ class State:
         return self._without[name]
 
 
-def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Scans prepared with places in the writing order of those that a model is known from."""
-    orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
-
-    def placed(scan: PreparedScan) -> PreparedScan:
-        order = float(np.interp(scan.stored.order, orders, places))
-        part = None if scan.quadrant is None else placed(scan.quadrant)
-        return replace(scan, context=replace(scan.context, order=order), quadrant=part)
-
-    return [placed(scan) for scan in prepare_scans(scans)]
-
-
 class TwinProblem:
-    """A twin on windows of scans; derivatives are one-sided differences.
+    """A twin on windows of scans; derivatives are one-sided differences."""
 
-    Args:
-        fold: of a base that was trained without each fold, the one without this fold; None: for each window
-            the one that has not seen it.
-    """
-
-    def __init__(self, twin: Twin, windows: Sequence[PreparedScan], fold: int | None = None):
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin = twin
         self._windows = windows
-        self._fold = fold
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         """Residuals, derivatives and free terms of all windows."""
         here = self._twin.at(vector)
         placed, steps = here.placed(), here.steps()
-        moved = [
-            here.at(vector + step * (np.arange(len(vector)) == i)).placed() for i, step in enumerate(steps)
-        ]
+        moved = [here.at(vector + one).placed() for one in np.diag(steps)]
         return [self._of_window(placed, moved, steps, window) for window in self._windows]
 
     def _of_window(
         self, placed: Placed, moved: Sequence[Placed], steps: np.ndarray, window: PreparedScan
     ) -> Linearised:
-        twin, own = placed.twin, placed.twin.own
-        chain = placed.chain(window)
-        layout = exposed(chain, window)
-        base = placed.height_of(layout, window, self._fold)
-        prediction = finished(chain, base, window)
+        twin, layout = placed.twin, placed.exposed(window)
+        base = placed.base_height(layout, window)
+        prediction = placed.height(window, base_um=base)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
-        for i, (other, step) in enumerate(zip(moved, steps, strict=True)):
-            slot = twin.slots[i - own] if i >= own else None
+        for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
             if slot is not None and not twin.is_of(slot, window):
                 continue
-            there = other.chain(window)
             # Only what is before a number in the chain stays as it is.
-            if slot is None:
-                height = other.height_of(layout, window, self._fold)
-            elif get_effect(slot.effect).acts_on == "height":
-                height = base
-            else:
-                height = other.base_height(there, window, self._fold)
-            rows[i] = (window.at_sample(finished(there, height, window)) - value) / step
+            known = other.base_height(layout, window) if slot is None else None
+            if slot is not None and get_effect(slot.effect).acts_on == "height":
+                known = base
+            rows[at] = (window.at_sample(other.height(window, base_um=known)) - value) / steps[at]
         basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
         return Linearised(window.height - value, rows, basis)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all windows, µm."""
         placed = self._twin.at(vector).placed()
-        return [w.height - w.at_sample(placed.height(w, self._fold)) for w in self._windows]
+        return [window.height - window.at_sample(placed.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effects stay within their range, the base does not go too far at once."""
@@ -199,19 +166,25 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     common = twin.at(fitted.vector)
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
-    per_fold, held_out = [], [np.empty(0)] * len(windows)
-    freed = np.empty(len(windows))
+    per_fold = []
     for fold in study.folds:
-        own = [i for i, of in enumerate(study.fold_of) if of != fold]
-        vector = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own], fold)
-        per_fold.append(vector)
-        placed = common.at(vector).placed()
-        for i in np.flatnonzero(study.fold_of == fold):
-            prediction = placed.height(windows[i], fold)
-            held_out[i] = windows[i].height - windows[i].at_sample(prediction)
-            left = without_terms(held_out[i][:, None], windows[i], prediction)
-            freed[i] = NM_PER_UM**2 * float(np.mean(left**2))
-    return State(common, np.stack(per_fold), linear, held_out, freed)
+        own = np.flatnonzero(study.fold_of != fold).tolist()
+        per_fold.append(_without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own]))
+    maps = held_out_maps(per_fold, study, windows)
+    held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
+    freed = [
+        without_terms(left[:, None], window, own)
+        for left, window, own in zip(held_out, windows, maps, strict=True)
+    ]
+    return State(
+        common, per_fold, linear, held_out, np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
+    )
+
+
+def held_out_maps(per_fold: Sequence[Twin], study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+    """Predicted prints (y, x), µm, each by the twin that has not seen the scan."""
+    placed = [twin.placed() for twin in per_fold]
+    return [placed[fold].height(scan) for fold, scan in zip(study.fold_of, scans, strict=True)]
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
@@ -223,7 +196,8 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     unfitted = twin.with_base_unfitted()
     if not twin.slots or np.array_equal(unfitted, twin.vector):
         return twin.vector
-    some = TwinProblem(twin, windows[::_START_EVERY] if len(windows) > 2 * _START_EVERY else windows)
+    # The way to the neighbourhood of the optimum is walked on every third scan.
+    some = TwinProblem(twin, windows[::3] if len(windows) > 6 else windows)
     fits = [fit_least_squares(some, start, RULES) for start in (twin.vector, unfitted)]
     return min(fits, key=lambda fit: eliminated_sum(fit.linear, RULES.term_weight)[2]).vector
 
@@ -236,31 +210,29 @@ def without_terms(
     return columns - basis @ (basis.T @ columns)
 
 
-def _without(
-    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan], fold: int
-) -> np.ndarray:
-    """Numbers fitted to some of the windows with the derivatives of the common fit.
+def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
+    """The twin fitted to some of the windows with the derivatives of the common fit.
 
     The common fit, which has seen all windows, is where it starts: nothing may be left there.
     """
-    vector = common.vector
+    twin = common.of_fold(fold)
+    problem, vector = TwinProblem(twin, windows), twin.vector
     if not len(vector):
-        return vector
-    if isinstance(common.base, FoldedBase):
+        return twin
+    if twin is not common:
         # At the common fit each window was predicted by a model that has seen the fold.
-        left = TwinProblem(common, windows, fold).residuals(vector)
-        linear = with_residuals(linear, left)
+        linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
-    for _ in range(_FOLD_STEPS):
-        step = solve_damped(normal, right, _FOLD_DAMPING, common.at(vector).room())
+    for _ in range(6):
+        step = solve_damped(normal, right, 1e-6, twin.at(vector).room())
         trial = vector + step
         # So small a step is what the derivatives say.
-        if promised_gain(normal, right, step) <= _FOLD_GAIN * total:
+        if promised_gain(normal, right, step) <= 1e-4 * total:
             vector = trial
             break
-        left = TwinProblem(common, windows, fold).residuals(trial)
-        _, right, squares = eliminated_sum(with_residuals(linear, left), RULES.term_weight)
+        left = with_residuals(linear, problem.residuals(trial))
+        _, right, squares = eliminated_sum(left, RULES.term_weight)
         if squares > total:
             break
         vector, total = trial, squares
-    return common.at(vector).known_from(windows).vector
+    return twin.at(vector).known_from(windows)

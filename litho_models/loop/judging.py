@@ -19,8 +19,6 @@ FEWEST_SCANS = 8
 GROUPED_P = 0.05
 SMALLEST_SHARE = 0.01
 SMALLEST_RMSE_NM = 0.5
-# A rival that loses this part of the gain in nearly every scan is told apart.
-TOLD_APART_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -76,6 +74,6 @@ def judge(before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study) -> Judgem
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Whether a rival is worse than the best in nearly every scan, by a good part of the gain."""
+    """Whether a rival is worse than the best in nearly every scan, by a quarter of the gain or more."""
     lost = judge(other_nm2, best_nm2, study)
-    return lost.p <= CONFIRM_P and lost.gain_nm2 >= TOLD_APART_SHARE * float((before_nm2 - best_nm2).mean())
+    return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

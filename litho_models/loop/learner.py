@@ -6,7 +6,7 @@ what a named cause weighs beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,16 +25,9 @@ from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
 # All rows of all scans; with more scans each is thinned.
-_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
-# Features whose strength may follow the place: height, ∂y and ∂x at 0.3 µm (a gain and a displacement); and
-# order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
-_PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
-_ORDER_STEPS = (-0.25, 0.0, 0.25)
-_FEWEST_ORDERS = 3
-# Cubic splines along each axis of a scan.
-_SPLINES = 5
-# Scans' worth of evidence for nothing to learn: which of them is chosen inside the training folds.
-_SHRINKING = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
+_KEPT_BYTES = 512 * 2**20
+# Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
+_VARYING = (18, 21, 22, 7)
 
 
 @dataclass(frozen=True)
@@ -43,12 +36,11 @@ class Rest:
 
     Attributes:
         gains_nm2: (scans,) taken from the squared error of each scan by the ridge that has not seen it.
-        squares_nm2: (scans,) the squared error itself; both free of ``k`` terms per scan.
+        squares_nm2: (scans,) the squared error itself; both free of what single scans may add.
     """
 
     gains_nm2: np.ndarray
     squares_nm2: np.ndarray
-    k: int
 
     @property
     def mean_nm2(self) -> float:
@@ -67,13 +59,14 @@ class Rest:
     @property
     def most_nm(self) -> float:
         """The root of the upper end of the interval: what the form of the model may be wrong by, rms."""
-        interval_nm2 = self.ci95_nm2
-        return float(np.sqrt(max(self.mean_nm2 if interval_nm2 is None else interval_nm2[1], 0.0)))
+        _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
+        return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
         """Whether something is left that can be learned: more than 1 %, and an interval without zero."""
-        return self.share > SMALLEST_SHARE and self.ci95_nm2 is not None and self.ci95_nm2[0] > 0
+        low, _ = self.ci95_nm2 or (0.0, None)
+        return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
@@ -88,20 +81,20 @@ class Learner:
         self._study = study
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
-        self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
-        varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= _FEWEST_ORDERS]
-        rows = [self._rows(model, scan, varied) for scan in study.scans]
+        self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
+        # By order, and by dose less its nominal value: both signs. Three of them, or nothing can follow them.
+        facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
+        varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
+        rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
         scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
         self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
         self._bases = [
             orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
             for scan, own in zip(study.scans, predictions, strict=True)
         ]
+        pairs = zip(self._rows_of, self._bases, strict=True)
         self._grams = np.stack(
-            [
-                (_gram(own) - gram_inside(own.T, basis)) / len(basis)
-                for own, basis in zip(self._rows_of, self._bases, strict=True)
-            ]
+            [(_gram(own) - gram_inside(own.T, basis)) / len(basis) for own, basis in pairs]
         )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
@@ -113,41 +106,27 @@ class Learner:
         scans, count = self._study.scans, self._grams.shape[1]
         grams = np.zeros((len(scans), 1 + count, 1 + count))
         grams[:, 1:, 1:] = self._grams
-        for scan, own, rows, basis, gram in zip(
-            scans, predictions, self._rows_of, self._bases, grams, strict=True
-        ):
+        parts = zip(scans, predictions, self._rows_of, self._bases, grams, strict=True)
+        for scan, own, rows, basis, gram in parts:
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
             gram[0, 0] = np.mean(residual**2)
             gram[0, 1:] = gram[1:, 0] = rows @ residual / len(residual)
         left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
-        return Rest(squares - left, squares, self._bases[0].shape[1])
+        return Rest(squares - left, squares)
 
-    def _rows(
-        self, model: Features, scan: PreparedScan, varied: Sequence[Callable[[PreparedScan], float]]
-    ) -> NDArray[np.float32]:
+    def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
         """Features of layout and place, and some times order and dose, (m, n)."""
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
-        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in _PLACED)]
-        for of in varied:
-            value = of(scan)
-            columns += [value * varying, *((value > step) * varying for step in _ORDER_STEPS)]
+        # Height, ∂y and ∂x, whose strength may follow the place: a gain and a displacement.
+        placed = (18, 19, 20)
+        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
+        for value in varied:
+            columns += [value * varying, *((value > step) * varying for step in (-0.25, 0.0, 0.25))]
         return np.concatenate(columns).astype(np.float32)
-
-
-def _order(scan: PreparedScan) -> float:
-    return scan.context.order
-
-
-def _dose(scan: PreparedScan) -> float:
-    """Less its nominal value, so that it has both signs as the order has."""
-    return (scan.stored.dose or 1.0) - 1.0
-
-
-_VARIED = (_order, _dose)
 
 
 def _gram(rows: np.ndarray) -> np.ndarray:
@@ -157,13 +136,13 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     """Mean squared residual (scans,) by ridges fitted, and their weight chosen, without each scan's fold."""
-    left = np.empty(len(grams))
+    left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
-    blocks = [Block(columns, ALL, shrinking) for shrinking in _SHRINKING]
-    products = Products(grams, {ALL: ("",) * len(grams)})
+    # Scans' worth of evidence for nothing to learn.
+    blocks = [Block(columns, ALL, shrinking) for shrinking in (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
-        inner, inner_of = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
+        inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
         # A single scan has nothing to choose on: the most cautious.
@@ -196,5 +175,5 @@ def _splines(size: int) -> np.ndarray:
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
-    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, _SPLINES - 2), [1.0] * 3])
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, 3), [1.0] * 3])
     return BSpline.design_matrix(position, knots, 3).toarray().T

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.effects import CATALOGUE
 from litho_models.loop.judging import CONFIRM_P, SMALLEST_RMSE_NM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding
@@ -19,10 +18,6 @@ from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
-# Heights closer than this share of their range are one value of a file that rounds in single precision.
-_SAME_VALUE, _OFF_COMB, _ON_COMB_SHARE = 1e-6, 0.05, 0.99
-# A mark stands out by so many robust standard deviations on so many pixels, and is so much longer than wide.
-_FAR_SD, _FEWEST_PX, _DRAWN_OUT, _FEWEST_SCARS = 5.0, 9, 4.0, 10
 # Beyond the sharpness of tip and spot, and within the length of a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
 
@@ -41,35 +36,31 @@ def marks(
         for scan, own in zip(scans, maps_um, strict=True)
     ]
     found = [_scars(scans, residuals), _short_lines(scans, maps_um, residuals), _bends(scans)]
-    if rounding_um is not None:
-        found.append(_rounding(list(rounding_um.values())))
-    return found
+    return found if rounding_um is None else [*found, _rounding([*rounding_um.values()])]
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
     """Terms and marks, each name once: it is there if either says so."""
     found = {one.name: one for one in findings}
     for mark in seen:
-        term = found.get(mark.name, mark)
-        first, second = (term, mark) if term.seen or not mark.seen else (mark, term)
-        evidence = "; ".join(dict.fromkeys((first.evidence, second.evidence)))
-        found[mark.name] = first.model_copy(update={"evidence": evidence})
+        # The one that says so first.
+        pair = sorted((found.get(mark.name, mark), mark), key=lambda one: not one.seen)
+        evidence = "; ".join(dict.fromkeys(one.evidence for one in pair))
+        found[mark.name] = pair[0].model_copy(update={"evidence": evidence})
     return [*found.values()]
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
     """Step of which all heights of a raw scan are multiples, up to one offset; 0 where there is none."""
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
-    if len(heights) < 3:
-        return 0.0
     steps = np.diff(heights)
-    steps = steps[steps > _SAME_VALUE * (heights[-1] - heights[0])]
+    # Nearer ones are one value of a file that rounds in single precision.
+    steps = steps[steps > 1e-6 * np.ptp(heights)] if len(heights) > 2 else steps[:0]
     if not len(steps):
         return 0.0
     step = float(np.median(steps[steps < 1.5 * steps.min()]))
     places = (heights - heights[0]) / step
-    off = np.abs(places - np.round(places))
-    return step if np.mean(off < _OFF_COMB) >= _ON_COMB_SHARE else 0.0
+    return step if np.mean(np.abs(places - np.round(places)) < 0.05) >= 0.99 else 0.0
 
 
 def _rounding(steps_um: Sequence[float]) -> ScanFinding:
@@ -77,12 +68,13 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
     if not len(rounded):
-        return _finding("quantisation", False, "the heights of the raw files share no common step")
-    text = (
-        f"the raw heights of {len(rounded)} of {len(steps_nm)} scans are multiples of "
-        f"{np.median(rounded):.3g} nm, which adds {noise_nm:.2g} nm rms"
-    )
-    return _finding("quantisation", noise_nm >= SMALLEST_RMSE_NM, text)
+        evidence = "the heights of the raw files share no common step"
+    else:
+        evidence = (
+            f"the raw heights of {len(rounded)} of {len(steps_nm)} scans are multiples of "
+            f"{np.median(rounded):.3g} nm, which adds {noise_nm:.2g} nm rms"
+        )
+    return ScanFinding.of("quantisation", evidence, seen=noise_nm >= SMALLEST_RMSE_NM)
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
@@ -91,21 +83,21 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
     along, across = counts.T
     p = one_sided_flip_p((along - across).astype(float))
     text = f"{along.sum()} outliers drawn out along the lines and {across.sum()} across them (p = {p:.4f})"
-    return _finding("scars-and-spikes", p <= CONFIRM_P and along.sum() >= _FEWEST_SCARS, text, p)
+    return ScanFinding.of("scars-and-spikes", text, seen=p <= CONFIRM_P and along.sum() >= 10, p=p)
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
     """Outliers that are long along the scan lines, and across them."""
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
-    numbered, _ = label(scan.usable & (np.abs(residual_um) > _FAR_SD * spread))
-    sizes = np.bincount(numbered.ravel())
-    along = across = 0
+    numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
+    sizes, along, across = np.bincount(numbered.ravel()), 0, 0
     for number, box in enumerate(find_objects(numbered), 1):
         height, width = (part.stop - part.start for part in box)
-        if sizes[number] >= _FEWEST_PX:
-            along += width >= _DRAWN_OUT * height
-            across += height >= _DRAWN_OUT * width
+        # On fewer pixels it is noise; a scratch is four times as long as wide.
+        if sizes[number] >= 9:
+            along += width >= 4 * height
+            across += height >= 4 * width
     return (across, along) if axis_along(scan.line) == 0 else (along, across)
 
 
@@ -120,12 +112,13 @@ def _short_lines(
     along, across = shared.T
     p = one_sided_flip_p(along - across)
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
+    first, last = _LINE_LAGS_UM
     text = (
-        f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² "
+        f"flat places {first:g} to {last:g} µm apart share {along.mean():.1f} nm² "
         f"along the lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
         f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
     )
-    return _finding("line-roughness", p <= CONFIRM_P and rms_nm >= SMALLEST_RMSE_NM, text, p)
+    return ScanFinding.of("line-roughness", text, seen=p <= CONFIRM_P and rms_nm >= SMALLEST_RMSE_NM, p=p)
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
@@ -141,17 +134,17 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
         values = np.where(flat, values - (total / np.maximum(count, 1))[line], 0.0)
     first, last = (max(1, round(lag / scan.context.pitch_um)) for lag in _LINE_LAGS_UM)
 
-    def mean_product(v: np.ndarray, w: np.ndarray) -> float:
-        lags = range(first, last + 1)
-        products = sum(float((v[:, lag:] * v[:, :-lag]).sum()) for lag in lags)
-        pairs = sum(float((w[:, lag:] * w[:, :-lag]).sum()) for lag in lags)
+    def mean_product(turned: bool) -> float:
+        shown = [one.T if turned else one for one in (values, flat.astype(float))]
+        products, pairs = (
+            sum(float((one[:, lag:] * one[:, :-lag]).sum()) for lag in range(first, last + 1))
+            for one in shown
+        )
         return products / max(pairs, 1.0)
 
-    by_row, by_column = (
-        mean_product(v, w) for v, w in ((values, flat.astype(float)), (values.T, flat.T.astype(float)))
-    )
     # A scan turned by 90 degrees has its lines along y.
-    return (by_column, by_row) if axis_along(scan.line) == 0 else (by_row, by_column)
+    turned = axis_along(scan.line) == 0
+    return mean_product(turned), mean_product(not turned)
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
@@ -160,16 +153,4 @@ def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
     text = f"registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:
         text += f", bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
-    return _finding("registration-residual", bool(found_um), text)
-
-
-def _finding(name: str, seen: bool, evidence: str, p: float | None = None) -> ScanFinding:
-    effect = CATALOGUE.get(name)
-    return ScanFinding(
-        name=name,
-        title=effect.title if effect else name,
-        role=effect.role if effect else "measurement",
-        seen=bool(seen),
-        evidence=evidence,
-        p=p,
-    )
+    return ScanFinding.of("registration-residual", text, seen=bool(found_um))

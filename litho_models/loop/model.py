@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -20,8 +21,8 @@ from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = dict[str, dict[str, float]]
-# Of the usual size of a number: a step of its difference quotient, and how near a bound is on it.
-_BASE_STEP, _EFFECT_STEP, _AT_BOUND = 5e-3, 0.05, 1e-6
+# How near a fitted number is to a bound that it stands on, of its size.
+_AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,7 @@ class Twin:
     @classmethod
     def of_base(cls, base: nn.Module, full_height_um: float, pitch_um: float) -> Twin:
         """The base alone, for layouts of this height and pitch."""
-        own = [p.detach().numpy().reshape(-1) for p in _parameters(base)]
-        vector = np.concatenate(own or [np.empty(0)]).astype(np.float64)
-        return cls(base, {}, {}, (), vector, full_height_um, pitch_um)
+        return cls(base, {}, {}, (), _numbers(base), full_height_um, pitch_um)
 
     @property
     def own(self) -> int:
@@ -89,42 +88,52 @@ class Twin:
         """The same with other numbers."""
         return replace(self, vector=vector)
 
+    def of_fold(self, fold: int) -> Twin:
+        """The same over a base that has not seen the fold, where one was trained without each."""
+        base = self.base
+        return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
+
     def with_effect(self, name: str, by: str, values: Mapping[str, Mapping[str, float]]) -> Twin:
         """One effect more, with starting values by label (``""`` for all scans)."""
         effect = get_effect(name)
         first = next(iter(values.values()))
-        slots, numbers = [], []
-        for parameter, facts in effect.parameters.items():
-            if facts.kind == "choice":
-                continue
-            labels = sorted(values) if facts.kind == "amplitude" and by != ALL else [None]
-            for label in labels:
-                slots.append(Slot(name, parameter, label))
-                numbers.append(first[parameter] if label is None else values[label][parameter])
-        chosen = {key: first[key] for key, facts in effect.parameters.items() if facts.kind == "choice"}
-        order = in_forward_order([*self.by, name])
+        fitted = {key: facts for key, facts in effect.parameters.items() if facts.kind != "choice"}
+        slots = [
+            Slot(name, key, label)
+            for key, facts in fitted.items()
+            for label in (sorted(values) if facts.kind == "amplitude" and by != ALL else [None])
+        ]
+        numbers = [values.get(slot.label or "", first)[slot.parameter] for slot in slots]
+        groupings = {**self.by, name: by}
         return replace(
             self,
-            by={one: {**self.by, name: by}[one] for one in order},
-            choices={**self.choices, name: chosen},
+            by={one: groupings[one] for one in in_forward_order(list(groupings))},
+            choices={
+                **self.choices,
+                name: {key: first[key] for key in effect.parameters if key not in fitted},
+            },
             slots=(*self.slots, *slots),
             vector=np.concatenate([self.vector, numbers]),
         )
 
-    def without(self, name: str) -> Twin:
-        """The same without one of its effects."""
-        kept = [i for i, slot in enumerate(self.slots) if slot.effect != name]
+    def only(self, names: Collection[str]) -> Twin:
+        """The same with no other effects than these."""
+        kept = [i for i, slot in enumerate(self.slots) if slot.effect in names]
         return replace(
             self,
-            by={one: by for one, by in self.by.items() if one != name},
-            choices={one: own for one, own in self.choices.items() if one != name},
+            by={one: by for one, by in self.by.items() if one in names},
+            choices={one: own for one, own in self.choices.items() if one in names},
             slots=tuple(self.slots[i] for i in kept),
             vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
         )
 
+    def without(self, name: str) -> Twin:
+        """The same without one of its effects."""
+        return self.only({*self.by} - {name})
+
     def alone(self) -> Twin:
         """The same without any effect."""
-        return replace(self, by={}, choices={}, slots=(), vector=self.vector[: self.own])
+        return self.only(())
 
     def ungrouped(self) -> Twin:
         """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
@@ -135,17 +144,14 @@ class Twin:
 
     def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
         """The same effects over another base."""
-        bare = Twin.bare(base, scan)
-        vector = np.concatenate([bare.vector, self.vector[self.own :]])
+        vector = np.concatenate([Twin.bare(base, scan).vector, self.vector[self.own :]])
         return replace(self, base=base, vector=vector)
 
     def with_base_unfitted(self) -> np.ndarray:
         """The numbers with the base's as they are before any fit."""
         if not (self.own and isinstance(self.base, Simulator)):
             return self.vector
-        fresh = type(self.base)(self.base.config)
-        own = np.concatenate([p.detach().numpy().reshape(-1) for p in _parameters(fresh)])
-        return np.concatenate([own.astype(np.float64), self.vector[self.own :]])
+        return np.concatenate([_numbers(type(self.base)(self.base.config)), self.vector[self.own :]])
 
     def values(self, label_in: Mapping[str, str]) -> Values:
         """Parameter values of all effects for the scans with these labels, by grouping.
@@ -157,8 +163,8 @@ class Twin:
         for slot, number in zip(self.slots, self.vector[self.own :], strict=True):
             alike.setdefault((slot.effect, slot.parameter), {})[slot.label] = float(number)
         for (name, parameter), known in alike.items():
-            label = None if None in known else label_in.get(self.by[name], "")
-            found[name][parameter] = known.get(label, float(np.mean(list(known.values()))))
+            mean = float(np.mean(list(known.values())))
+            found[name][parameter] = known.get(label_in.get(self.by[name], ""), mean)
         return found
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
@@ -192,23 +198,29 @@ class Twin:
 
     def steps(self) -> np.ndarray:
         """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
-        steps = _BASE_STEP * np.maximum(np.abs(self.vector), 0.2)
-        for at, slot in enumerate(self.slots, self.own):
-            facts = slot.facts
-            usual = facts.typical - (facts.null if facts.kind == "amplitude" else 0.0)
-            size = _EFFECT_STEP * abs(usual)
-            steps[at] = size if self.vector[at] + size <= facts.upper else -size
-        return steps
+        _, upper, usual = self._ranges()
+        own, size = self.vector[: self.own], 0.05 * usual
+        effects = np.where(self.vector[self.own :] + size <= upper, size, -size)
+        return np.concatenate([5e-3 * np.maximum(np.abs(own), 0.2), effects])
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest step (p,) allowed from here: base and effects within their ranges."""
-        lowest, highest = np.zeros(len(self.vector)), np.zeros(len(self.vector))
-        if self.own:
-            lowest[: self.own], highest[: self.own] = parameter_room(self.base, self.vector[: self.own])
-        for at, slot in enumerate(self.slots, self.own):
-            facts = slot.facts
-            lowest[at], highest[at] = facts.lower - self.vector[at], facts.upper - self.vector[at]
-        return np.minimum(lowest, 0), np.maximum(highest, 0)
+        lower, upper, _ = self._ranges()
+        own, effects = self.vector[: self.own], self.vector[self.own :]
+        lowest, highest = parameter_room(self.base, own) if self.own else (own, own)
+        return (
+            np.minimum(np.concatenate([lowest, lower - effects]), 0),
+            np.maximum(np.concatenate([highest, upper - effects]), 0),
+        )
+
+    def _ranges(self) -> np.ndarray:
+        """Of each effect's number lower bound, upper bound and usual size, (3, slots)."""
+        facts = [slot.facts for slot in self.slots]
+        nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
+        known = [
+            (one.lower, one.upper, abs(one.typical - null)) for one, null in zip(facts, nulls, strict=True)
+        ]
+        return np.array(known).reshape(-1, 3).T
 
     def free(self) -> np.ndarray:
         """True for numbers (p,) with room on both sides."""
@@ -248,61 +260,47 @@ class Placed:
         self.twin = twin
         self.base = copy.deepcopy(twin.base) if twin.own else twin.base
         at = 0
-        for parameter in _parameters(self.base):
+        for parameter in _parameters(self.base) if twin.own else ():
             values = twin.vector[at : at + parameter.numel()]
             parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
             at += parameter.numel()
-        self._chains: dict[tuple[str, ...], EffectChain] = {}
+        self._known = cache(self.of_labels)
 
     def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
         """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
-        return self.of_labels(self.twin.labels(scan), extra)
+        labels = tuple(self.twin.labels(scan).items())
+        return self._known(labels) if extra is None else self.of_labels(labels, extra)
 
-    def of_labels(self, labels: Mapping[str, str], extra: Values | None = None) -> EffectChain:
+    def of_labels(self, labels: tuple[tuple[str, str], ...] = (), extra: Values | None = None) -> EffectChain:
         """The chain for scans with these labels, by grouping; without any it has the mean strengths."""
-        key = tuple(labels.values())
-        if extra is not None or key not in self._chains:
-            chain = EffectChain(
-                self.base,
-                {**self.twin.values(labels), **(extra or {})},
-                full_height_um=self.twin.full_height_um,
-                pitch_um=self.twin.pitch_um,
-                scan_frame=self.twin.scan_frame,
-                print_frame=self.twin.print_frame,
-            )
-            if extra is not None:
-                return chain
-            self._chains[key] = chain
-        return self._chains[key]
+        return EffectChain(
+            self.base,
+            {**self.twin.values(dict(labels)), **(extra or {})},
+            full_height_um=self.twin.full_height_um,
+            pitch_um=self.twin.pitch_um,
+            scan_frame=self.twin.scan_frame,
+            print_frame=self.twin.print_frame,
+        )
 
-    def base_height(self, chain: EffectChain, scan: PreparedScan, fold: int | None = None) -> Tensor:
-        """Height (1, 1, y, x), µm, of the base on the layout with the effects that act on it."""
-        return self.height_of(exposed(chain, scan), scan, fold)
+    @torch.no_grad()
+    def exposed(self, scan: PreparedScan, extra: Values | None = None) -> Tensor:
+        """The layout (1, 1, y, x), µm, with the effects that act on it."""
+        return self.chain(scan, extra).before_base(scan.context.layout_um, scan.context)
 
-    def height_of(self, exposed_um: Tensor, scan: PreparedScan, fold: int | None = None) -> Tensor:
+    @torch.no_grad()
+    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
         """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
-        base = self.base
-        if isinstance(base, FoldedBase):
-            base = base.of_scan(scan.id) if fold is None else base.of_fold(fold)
-        with torch.no_grad():
-            return base(exposed_um)
+        base = self.base.of_scan(scan.id) if isinstance(self.base, FoldedBase) else self.base
+        return base(exposed_um)
 
-    def height(self, scan: PreparedScan, fold: int | None = None) -> np.ndarray:
-        """Predicted height of the print (y, x), µm."""
-        chain = self.chain(scan)
-        return finished(chain, self.base_height(chain, scan, fold), scan)
-
-
-def exposed(chain: EffectChain, scan: PreparedScan) -> Tensor:
-    """The layout (1, 1, y, x), µm, with the effects that act on it."""
-    with torch.no_grad():
-        return chain.before_base(scan.layout, scan.context)
-
-
-def finished(chain: EffectChain, base_height: Tensor, scan: PreparedScan) -> np.ndarray:
-    """The height (y, x), µm, with the effects that act on it."""
-    with torch.no_grad():
-        return chain.after_base(base_height, scan.context)[0, 0].numpy()
+    @torch.no_grad()
+    def height(
+        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
+    ) -> np.ndarray:
+        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
+        if base_um is None:
+            base_um = self.base_height(self.exposed(scan, extra), scan)
+        return self.chain(scan, extra).after_base(base_um, scan.context)[0, 0].numpy()
 
 
 def is_refitted(base: nn.Module) -> bool:
@@ -313,3 +311,8 @@ def is_refitted(base: nn.Module) -> bool:
 
 def _parameters(base: nn.Module) -> Sequence[nn.Parameter]:
     return [p for p in base.parameters() if p.requires_grad] if is_refitted(base) else []
+
+
+def _numbers(base: nn.Module) -> np.ndarray:
+    own = [p.detach().numpy().reshape(-1) for p in _parameters(base)]
+    return np.concatenate(own or [np.empty(0)]).astype(np.float64)

@@ -13,7 +13,6 @@ from litho_data.store import PrintedScan
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import without_terms
-from litho_models.loop.model import finished
 from litho_models.loop.record import Planted
 
 
@@ -51,8 +50,7 @@ def plant(
     changed, squares = [], []
     for scan in closed.original:
         here = placed.height(scan)
-        chain = placed.chain(scan, values)
-        added = finished(chain, placed.base_height(chain, scan), scan) - here
+        added = placed.height(scan, values) - here
         changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
         freed = without_terms(scan.at_sample(added)[:, None], scan, here)
         squares.append(float(np.mean(freed**2)))

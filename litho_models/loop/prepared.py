@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,14 +16,8 @@ from litho_models.effects import FieldContext
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# Fits and screening keep away from the edge: pixels nearer to it see a neighbourhood that the layout does not
-# hold. Errors are scored on all pixels, as in the benchmark (``Blocks.border_px``).
-SAMPLE_BORDER_PX = 8
-# About as many pixels per scan as carry independent information: residuals correlate over ~5 px.
-SAMPLE_PX = 16384
-# Fits and screening of larger scans see one quadrant and this margin around it.
+# Fits and screening of scans this large see one quadrant, and a margin around it.
 LARGE_PX = 400
-MARGIN_PX = 48
 
 
 @dataclass(frozen=True)
@@ -31,9 +26,7 @@ class PreparedScan:
 
     Attributes:
         stored: the scan as it lies in the store.
-        layout: nominal height times relative dose (1, 1, y, x) float32, µm.
-        context: its place, for the effects.
-        usable: bool (y, x), measured pixels; scored.
+        context: its place, for the effects, and what is exposed.
         sample: flat indices of thinned usable pixels away from the edge; fitted and screened.
         height: measured height at ``sample``, float64 µm.
         line: index of the scan line under each pixel (y, x).
@@ -41,13 +34,16 @@ class PreparedScan:
     """
 
     stored: PrintedScan
-    layout: Tensor
     context: FieldContext
-    usable: np.ndarray
     sample: np.ndarray
     height: np.ndarray
     line: LineIndex
     quadrant: PreparedScan | None = None
+
+    @cached_property
+    def usable(self) -> np.ndarray:
+        """Measured pixels, bool (y, x); scored."""
+        return self.stored.usable
 
     @property
     def id(self) -> str:
@@ -56,13 +52,6 @@ class PreparedScan:
     @property
     def window(self) -> PreparedScan:
         return self if self.quadrant is None else self.quadrant
-
-    @property
-    def position(self) -> np.ndarray:
-        """(2, n) of (y, x) at ``sample``, -1 ... 1 over the scan."""
-        ny, nx = self.usable.shape
-        y, x = np.divmod(self.sample, nx)
-        return np.stack([2 * y / max(ny - 1, 1) - 1, 2 * x / max(nx - 1, 1) - 1])
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
         """Values of a (…, y, x) map at the thinned pixels, float64."""
@@ -84,10 +73,20 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
         raise InputError("scans to close the loop on", got="none", wanted="at least one")
     ranks = np.argsort(np.argsort([scan.order for scan in scans], kind="stable"), kind="stable")
     scaled = ranks / max(len(scans) - 1, 1) - 0.5 if len({s.order for s in scans}) > 1 else 0.0 * ranks
-    return [
-        _with_quadrant(_prepare(s, float(order)), i)
-        for i, (s, order) in enumerate(zip(scans, scaled, strict=True))
-    ]
+    prepared = map(_prepare, scans, scaled.tolist())
+    return [_with_quadrant(one, number) for number, one in enumerate(prepared)]
+
+
+def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
+    """Scans prepared with places in the writing order of those that a model is known from."""
+    orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
+
+    def placed(scan: PreparedScan) -> PreparedScan:
+        order = float(np.interp(scan.stored.order, orders, places))
+        part = None if scan.quadrant is None else placed(scan.quadrant)
+        return replace(scan, context=replace(scan.context, order=order), quadrant=part)
+
+    return [placed(scan) for scan in prepare_scans(scans)]
 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
@@ -111,65 +110,64 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         pixel_size=1.0 if scan.pixel_size is None else float(scan.pixel_size),
         dose=dose,
     )
-    return _thinned(scan, context, scan.usable, scan.usable & _inner(scan.shape), line)
+    return _thinned(scan, context, scan.usable & _inner(scan.shape), line)
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
     """Large scans get a window: scans take their four quadrants in turn, so that all places are covered."""
-    ny, nx = scan.stored.shape
-    if min(ny, nx) < LARGE_PX:
+    shape, pitch = scan.stored.shape, scan.stored.pitch_um
+    if min(shape) < LARGE_PX:
         return scan
-    rows, row_start = _half(ny, number % 2)
-    columns, column_start = _half(nx, number // 2 % 2)
-    cut = (rows, columns)
-    own = np.zeros_like(scan.usable)
-    own[row_start : row_start + ny // 2, column_start : column_start + nx // 2] = True
-    usable = (own & scan.usable & _inner((ny, nx)))[cut]
+    halves = zip(shape, (number % 2, number // 2 % 2), strict=True)
+    cut, own = zip(*[_half(size, bool(second)) for size, second in halves], strict=True)
+    mine = np.zeros(shape, bool)
+    mine[own] = True
     sigma_um = scan.stored.height_sigma_um
     part = replace(
         scan.stored,
         mask_level=scan.stored.mask_level[cut],
         height_um=scan.stored.height_um[cut],
-        valid=usable,
+        valid=(mine & scan.usable & _inner(shape))[cut],
         height_sigma_um=None if sigma_um is None else sigma_um[cut],
     )
-    pitch = scan.stored.pitch_um
-    centre = tuple(
-        old + ((side.start + side.stop) / 2 - n / 2) * pitch
-        for old, side, n in zip(scan.context.field_centre_um, cut, (ny, nx), strict=True)
+    y_um, x_um = (
+        old + ((side.start + side.stop) / 2 - size / 2) * pitch
+        for old, side, size in zip(scan.context.field_centre_um, cut, shape, strict=True)
     )
     context = replace(
         scan.context,
-        layout_um=scan.layout[..., rows, columns],
-        field_centre_um=(centre[0], centre[1]),
+        layout_um=scan.context.layout_um[(..., *cut)],
+        field_centre_um=(y_um, x_um),
         field_radius_um=scan.context.radius_um(),
-        scan_shape=(ny, nx),
-        origin_px=(rows.start, columns.start),
+        scan_shape=shape,
+        origin_px=(cut[0].start, cut[1].start),
     )
-    return replace(scan, quadrant=_thinned(part, context, usable, usable, scan.line[cut]))
+    return replace(scan, quadrant=_thinned(part, context, part.usable, scan.line[cut]))
 
 
-def _half(size: int, second: int) -> tuple[slice, int]:
-    """Half of an axis with a margin towards the other half, and where the half itself starts."""
+def _half(size: int, second: bool) -> tuple[slice, slice]:
+    """Half of an axis with a margin of 48 pixels towards the other half, and without."""
     middle = size // 2
-    return (slice(middle - MARGIN_PX, size), middle) if second else (slice(0, middle + MARGIN_PX), 0)
+    if second:
+        return slice(middle - 48, size), slice(middle, middle + size // 2)
+    return slice(0, middle + 48), slice(0, middle)
 
 
 def sample_border_px(size: int) -> int:
-    """Pixels at either end of an axis of this shortest length that are not sampled."""
-    return min(SAMPLE_BORDER_PX, size // 8)
+    """Pixels at either end of an axis of this shortest length that are not sampled.
+
+    They see a neighbourhood that the layout does not hold. Errors are scored on all pixels, as in the
+    benchmark (``Blocks.border_px``).
+    """
+    return min(8, size // 8)
 
 
 def _inner(shape: tuple[int, int]) -> np.ndarray:
     border = sample_border_px(min(shape))
-    inner = np.zeros(shape, bool)
-    inner[border : shape[0] - border, border : shape[1] - border] = True
-    return inner
+    return np.pad(np.ones([size - 2 * border for size in shape], bool), border)
 
 
-def _thinned(
-    scan: PrintedScan, context: FieldContext, usable: np.ndarray, sampled: np.ndarray, line: LineIndex
-) -> PreparedScan:
-    sample = thinned(sampled, SAMPLE_PX)
-    height = scan.height_um.reshape(-1)[sample].astype(np.float64)
-    return PreparedScan(scan, context.layout_um, context, usable, sample, height, line)
+def _thinned(scan: PrintedScan, context: FieldContext, sampled: np.ndarray, line: LineIndex) -> PreparedScan:
+    # About as many pixels as carry independent information: residuals correlate over ~5 px.
+    sample = thinned(sampled, 16384)
+    return PreparedScan(scan, context, sample, scan.height_um.reshape(-1)[sample].astype(np.float64), line)

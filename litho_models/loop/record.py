@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -10,6 +9,7 @@ from pydantic import Field
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
+from litho_models.effects import CATALOGUE
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy
@@ -57,6 +57,11 @@ class ErrorRow(Record):
     mae_ci95_nm: tuple[float, float] | None
     rmse_nm: float
     by_scan_nm: dict[str, float]
+
+    @property
+    def is_headline(self) -> bool:
+        """Whether it is the one that is quoted: k = 1, the shared measurement, folds of scans."""
+        return (self.policy, self.measurement, self.held_out) == ("offset", "shared", "scans")
 
 
 class Strength(Record):
@@ -127,9 +132,17 @@ class ScanFinding(Record):
     role: Role
     seen: bool
     evidence: str
-    p: float | None
+    p: float | None = None
     spread: dict[str, Strength] = Field(default_factory=dict)
     confusable_with: list[str] = Field(default_factory=list)
+
+    @classmethod
+    def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
+        """With title and role of the catalogue, where it has the name and nothing else is said."""
+        effect = CATALOGUE.get(name)
+        role = effect.role if effect else "measurement"
+        known = {"title": effect.title if effect else name, "role": role, **facts}
+        return cls(name=name, evidence=evidence, seen=bool(seen), **known)
 
 
 class Planted(Record):
@@ -228,17 +241,6 @@ class CloseLoop(Result):
         held_out: str = "scans",
     ) -> ErrorRow | None:
         """One row of the errors; None if it was not measured."""
-        return error_of(self.errors, model, policy, measurement, held_out)
-
-
-def error_of(
-    errors: Sequence[ErrorRow],
-    model: Stage,
-    policy: Policy = "offset",
-    measurement: MeasuredBy = "shared",
-    held_out: str = "scans",
-) -> ErrorRow | None:
-    """The row of some errors with these terms; None if there is none."""
-    wanted = model, policy, measurement, held_out
-    rows = (row for row in errors if (row.model, row.policy, row.measurement, row.held_out) == wanted)
-    return next(rows, None)
+        wanted = model, policy, measurement, held_out
+        rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)
+        return next(rows, None)

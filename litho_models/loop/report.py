@@ -8,26 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.reports.page import Page, capitalised
+from litho_data.reports.page import Page, sentences
 from litho_data.reports.pictures import new_figure
-from litho_models.loop.record import CloseLoop, Decision, ErrorRow, FoundEffect, ScanFinding
-from litho_models.scan_terms.grouped import ALL
+from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
-_BEFORE, _AFTER = "#9aa5b1", "#2f7fd0"
-_STAGES = {
-    "base": "base",
-    "causes": "with the causes",
-    "all": "corrected",
-}
-_SHOWN_SCANS = 3
-_OF_EFFECT = (
-    *("name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm", "family_p"),
-    "confusable_with",
-)
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
@@ -39,15 +27,19 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
         words=Path(__file__).with_name("words.toml"),
     )
-    page.verdict(verdict_text(result))
+    page.verdict(said("verdict", result))
     page.tiles(
-        [(f"{row.mae_nm:.2f} nm", f"{_STAGES[row.model]}, k = {row.k:g}") for row in _headline(result)]
+        [(f"{row.mae_nm:.2f} nm", f"{said('stage', row.model)}, k = {row.k:g}") for row in _headline(result)]
     )
     page.figure(_bars(result), "Error on held-out scans, zero of each scan free. Grey: the base.")
     if result.effects:
         page.heading("What was found")
-        page.points([effect_text(one) for one in result.effects])
-        page.table(result.effects, "What was added.", "effects.csv", columns=_OF_EFFECT)
+        page.points([said("effect", one) for one in result.effects])
+        columns = (
+            *("name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm"),
+            *("family_p", "confusable_with"),
+        )
+        page.table(result.effects, "What was added.", "effects.csv", columns=columns)
         page.table(
             [row for one in result.effects for row in _strength_rows(one)],
             "Strengths with 95 % intervals, by what each print (or scan) asks for.",
@@ -56,7 +48,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         )
     if result.decisions:
         page.heading("What new prints decide")
-        page.points([decision_text(one) for one in result.decisions])
+        page.points([said("decision", one) for one in result.decisions])
     page.heading("Where the residual lies")
     page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
     page.table(
@@ -71,10 +63,10 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         "errors.csv",
     )
     page.heading("What scans share beside their prints", folded=True)
-    page.paragraph(measurement_text(result))
+    page.paragraph(said("measurement", result.measurement))
     page.heading("What single scans add", folded=True)
     page.table(
-        [_scan_row(one) for one in result.single_scans],
+        [one.model_dump() | {"spread": _spread(one)} for one in result.single_scans],
         "Each scan its own; no model has it. Spread: standard deviation over scans.",
         "single_scans.csv",
     )
@@ -88,84 +80,23 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     return page.write(folder)
 
 
-def verdict_text(result: CloseLoop) -> str:
-    """The answer in one or two sentences."""
-    names = [one.name + _by(one) for one in result.effects if one.knowledge == "cause"]
-    laws = [one.title for one in result.effects if one.knowledge == "law"]
-    before, after = _headline(result)[0], _headline(result)[-1]
-    gain = f"On held-out scans the error goes from {before.mae_nm:.2f} to {after.mae_nm:.2f} nm (k = 1)."
-    found = "; ".join(
-        part
-        for part in (
-            f"the model lacks {', '.join(names)}" if names else "",
-            f"and follows {'; '.join(laws)}" if laws and names else "",
-            f"the {'; '.join(laws)}" if laws and not names else "",
-        )
-        if part
-    )
-    if result.verdict == "traced":
-        return f"{found[0].upper()}{found[1:]}. {gain}"
-    said = {
-        "described": "What is left follows the layout or the place, but no cause and no short law holds.",
-        "nothing-missing": "Nothing is missing that these scans can show.",
-        "unexplained": "Something is missing: no cause, law or table holds on held-out scans.",
-        "too-few-scans": f"Nothing can be confirmed: at least {result.fewest_scans} scans are needed.",
-    }
-    return f"{said[result.verdict]} {gain}"
-
-
-def effect_text(one: FoundEffect) -> str:
-    """An effect with its size, in a sentence."""
-    sizes = [
-        f"{name} {own.value:.3g}{'' if own.unit == '1' else ' ' + own.unit}"
-        f"{f' ({own.label})' if own.label else ''}"
-        for name, strengths in one.strengths.items()
-        for own in strengths
-    ]
-    better, count = one.scans_improved
-    alike = (
-        f" These scans cannot tell it from {', '.join(one.confusable_with)}." if one.confusable_with else ""
-    )
-    bases = f" It holds on {', '.join(one.survives_on)} too." if one.survives_on else ""
-    return (
-        f"{one.name}{_by(one)}: {one.title}; {', '.join(sizes)}. It takes {one.gain_nm2:.0f} of "
-        f"{one.before_nm2:.0f} nm² and is better on {better} of {count} held-out scans.{alike}{bases}"
-    )
-
-
-def decision_text(one: Decision) -> str:
-    """What new prints say of a question."""
-    left = ", ".join(one.left) or "none"
-    return f"New prints on {one.question}: {one.verdict}, {left}. {capitalised(one.evidence)}."
-
-
-def measurement_text(result: CloseLoop) -> str:
-    """What the scans share, in words."""
-    parts = [
-        f"{part.what} by {part.by} (degree {part.degree}, {part.numbers} numbers)"
-        for part in result.measurement.parts
-    ]
-    levelled = {"none": "not levelled", "plane": "freed of x and y", "twist": "freed of x, y and xy"}
-    state = levelled.get(result.measurement.levelling, "freed of x, y, xy, x² and y²")
-    return f"Predictions are {state}, as the files are. Shared: {'; '.join(parts) or 'nothing'}."
-
-
-def _by(one: FoundEffect) -> str:
-    return "" if one.by == ALL else f" by {one.by}"
+def said(about: str, one: object) -> str:
+    """In words: the ``verdict`` of a result, an ``effect``, a ``decision``, a ``measurement`` model."""
+    return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 
 def _headline(result: CloseLoop) -> list[ErrorRow]:
-    rows = [result.error(stage) for stage in ("base", "causes", "all")]
-    return [row for row in rows if row is not None]
+    """Errors of the stages, k = 1, with the shared measurement."""
+    return [row for row in result.errors if row.is_headline]
 
 
 def _bars(result: CloseLoop) -> Figure:
-    rows = [row for row in (result.error("base", "offset", "published"), *_headline(result)) if row]
-    labels = ["base, published protocol", *(_STAGES[row.model] for row in rows[1:])]
+    rows = [row for row in (result.error("base", measurement="published"), *_headline(result)) if row]
+    labels = ["base, published protocol", *(said("stage", row.model) for row in rows[1:])]
     figure = new_figure(9, 0.45 * len(rows) + 1.1)
     axes = figure.subplots()
     at = np.arange(len(rows))[::-1]
-    colours = [_BEFORE if row.model == "base" else _AFTER for row in rows]
+    colours = ["#9aa5b1" if row.model == "base" else "#2f7fd0" for row in rows]
     drawn = axes.barh(at, [row.mae_nm for row in rows], color=colours, height=0.66)
     axes.bar_label(drawn, fmt="%.2f", padding=4)
     axes.set_yticks(at, labels)
@@ -176,41 +107,31 @@ def _bars(result: CloseLoop) -> Figure:
 
 
 def _residuals(maps: Maps) -> Figure:
+    """Maps of the scans with the largest, a middling and the smallest error of the base."""
     size = [float(np.nanmean(before**2)) for _, before, _ in maps]
-    order = np.argsort(size)[::-1]
-    picked = order[np.unique(np.linspace(0, len(order) - 1, _SHOWN_SCANS).astype(int))]
+    order = np.argsort(size)[::-1][[0, (len(maps) - 1) // 2, -1]].tolist()
+    shown = [maps[at] for at in dict.fromkeys(order)]
     limit = 2.5 * float(np.sqrt(np.mean(size)))
-    figure = new_figure(4 * len(picked) + 0.8, 8)
-    axes = figure.subplots(2, len(picked), squeeze=False)
-    for column, at in enumerate(picked):
-        name, *pair = maps[at]
-        for row, own in enumerate(pair):
-            panel = axes[row, column]
+    figure = new_figure(4 * len(shown) + 0.8, 8)
+    axes = figure.subplots(2, len(shown), squeeze=False)
+    for column, (name, *pair) in zip(axes.T, shown, strict=True):
+        for panel, when, own in zip(column, ("before", "after"), pair, strict=True):
             panel.imshow(own, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-            panel.set_title(
-                f"{name} {('before', 'after')[row]}: {np.nanmean(np.abs(own)):.1f} nm", fontsize=10
-            )
+            panel.set_title(f"{name} {when}: {np.nanmean(np.abs(own)):.1f} nm", fontsize=10)
             panel.set_axis_off()
     figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - expected (nm)", shrink=0.6)
     return figure
 
 
-def _scan_row(one: ScanFinding) -> dict[str, object]:
-    spread = (f"{name} {own.value:.3g} {own.unit}" for name, own in one.spread.items())
-    return {**one.model_dump(), "spread": ", ".join(spread)}
-
-
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
-    return [
-        {
-            "effect": one.name,
-            "parameter": name,
-            "group": own.label,
-            "value": own.value,
-            "unit": own.unit,
-            "from": None if own.ci95 is None else own.ci95[0],
-            "to": None if own.ci95 is None else own.ci95[1],
-        }
-        for name, strengths in one.strengths.items()
-        for own in strengths
-    ]
+    rows = []
+    for name, strengths in one.strengths.items():
+        for own in strengths:
+            low, high = own.ci95 or (None, None)
+            facts = {"group": own.label, "value": own.value, "unit": own.unit, "from": low, "to": high}
+            rows.append({"effect": one.name, "parameter": name, **facts})
+    return rows
+
+
+def _spread(one: ScanFinding) -> str:
+    return ", ".join(f"{name} {own.value:.3g} {own.unit}" for name, own in one.spread.items())

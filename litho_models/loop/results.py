@@ -25,17 +25,12 @@ from litho_models.loop.record import (
     ScanFinding,
     Strength,
     Verdict,
-    error_of,
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
-
-_BASE_ABSORBS = 1e-2
-# Numbers whose estimates move together this much are known together only.
-_CONFOUNDED = 0.95
 
 
 def record(
@@ -55,9 +50,8 @@ def record(
     """
     study, scans = closed.study, closed.study.scans
     effects = [_found(closed, one, left_out_nm, survives_on) for one in closed.found]
-    before, after = error_of(errors, "base"), error_of(errors, "all")
-    assert before is not None
-    assert after is not None
+    by_stage = {row.model: row for row in errors if row.is_headline}
+    before, after = by_stage["base"], by_stage["all"]
     gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
@@ -152,35 +146,24 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
     """Numbers of an effect with intervals from what each print (or scan) asks for; of a table alone."""
     from scipy.stats import t
 
-    state, effect, name = closed.final, get_effect(cause.name), cause.name
-    if cause.values:
-        return {
-            parameter: [
-                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
-                for label, values in cause.values.items()
-            ]
-            for parameter, facts in effect.parameters.items()
-        }
-    twin = state.twin
-    units = independent(closed.study.scans)
-    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state.linear, units)), 0.0))
-    reach = float(t.ppf(0.975, max(len(set(units)) - 1, 1)))
-    found: dict[str, list[Strength]] = {}
-    for at, slot in enumerate(twin.slots, twin.own):
-        if slot.effect == name:
-            value, half = float(twin.vector[at]), reach * float(sd[at])
-            found.setdefault(slot.parameter, []).append(
-                Strength(
-                    label=slot.label or "",
-                    value=value,
-                    unit=slot.facts.unit,
-                    ci95=(value - half, value + half) if sd[at] else None,
-                )
-            )
-    for parameter, value in twin.choices[name].items():
-        found[parameter] = [
-            Strength(label="", value=value, unit=effect.parameters[parameter].unit, ci95=None)
-        ]
+    facts, found = get_effect(cause.name).parameters, dict[str, list[Strength]]()
+
+    def add(parameter: str, label: str, value: float, half: float = 0.0) -> None:
+        ci95 = (value - half, value + half) if half else None
+        own = Strength(label=label, value=value, unit=facts[parameter].unit, ci95=ci95)
+        found.setdefault(parameter, []).append(own)
+
+    for label, values in cause.values.items():
+        for parameter, value in values.items():
+            add(parameter, label, value)
+    twin, units = closed.final.twin, independent(closed.study.scans)
+    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
+    reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
+    for slot, own, half in zip(twin.slots, twin.vector[twin.own :], reach[twin.own :], strict=True):
+        if slot.effect == cause.name:
+            add(slot.parameter, slot.label or "", float(own), float(half))
+    for parameter, value in twin.choices.get(cause.name, {}).items():
+        add(parameter, "", value)
     return found
 
 
@@ -213,58 +196,58 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
     free = np.flatnonzero(np.diag(normal) > 0)
     covariance = np.linalg.pinv(normal[np.ix_(free, free)], rcond=1e-10, hermitian=True)
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / np.outer(sd, sd)
+    correlation = np.triu(covariance / np.outer(sd, sd), 1)
     own = [*_values(twin)]
     if len(own) != twin.own:
         own = [f"base {i}" for i in range(twin.own)]
     names = [*own, *(" ".join(filter(None, (s.effect, s.parameter, s.label))) for s in twin.slots)]
-    pairs = zip(*np.nonzero(np.triu(np.abs(correlation), 1) >= _CONFOUNDED), strict=True)
+    pairs = np.argwhere(np.abs(correlation) >= 0.95).tolist()
     return [(names[free[i]], names[free[j]], float(correlation[i, j])) for i, j in pairs]
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
     """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
     sets = {other: one.name for one in added for other in one.confusable_with}
-    done = {*seen, *(one.name for one in added)}
     untestable = {**UNTESTABLE, **closed.untestable}
-    found = [
-        Candidate(name=name, verdict="not-testable", reason=reason)
-        for name, reason in untestable.items()
-        if name not in done
-    ]
-    found += [
-        _candidate(closed, name, sets)
-        for name, effect in CATALOGUE.items()
-        if name not in {*done, *untestable} and not effect.per_scan
-    ]
+    names = dict.fromkeys([*untestable, *(one.name for one in CATALOGUE.values() if not one.per_scan)])
+    found = []
+    for name in names:
+        if name not in seen and all(one.name != name for one in added):
+            verdict, reason = _refused(closed, name, sets, untestable)
+            last = closed.chosen.named.screened(name)
+            found.append(
+                Candidate(
+                    name=name,
+                    verdict=verdict,
+                    reason=reason,
+                    p_screen=closed.chosen.named.family_p.get(name),
+                    gain_nm2=last.gain_nm2 if last else None,
+                )
+            )
     return found
 
 
-def _candidate(closed: Closed, name: str, sets: Mapping[str, str]) -> Candidate:
-    named = closed.chosen.named
-    last = named.last.get(name) or named.first.get(name)
-    p = named.family_p.get(name)
-    verdict: CandidateVerdict
+def _refused(
+    closed: Closed, name: str, sets: Mapping[str, str], untestable: Mapping[str, str]
+) -> tuple[CandidateVerdict, str]:
+    """Why an effect is not in the model."""
+    named, count = closed.chosen.named, len(closed.study.scans)
+    last, refused = named.screened(name), named.refused.get(name, "")
+    if name in untestable:
+        return "not-testable", untestable[name]
     if name in sets:
-        verdict, reason = "confusable", f"cannot be told from {sets[name]}, which was added"
-    elif any(one.cause.name == name and one.reason for one in closed.chosen.checked):
-        verdict, reason = "resembles", named.refused.get(name, "")
-    elif last is None:
-        verdict, reason = "not-testable", "not screened"
-    elif len(closed.study.scans) < FEWEST_SCANS:
-        verdict, reason = (
-            "too-few-scans",
-            f"{len(closed.study.scans)} scans to choose and confirm on, at least {FEWEST_SCANS} needed",
-        )
-    elif last.beside_base < SMALLEST_RETAINED:
-        verdict, reason = "not-testable", "on these layouts it changes nothing that single scans do not"
-    elif last.retained < max(_BASE_ABSORBS * last.beside_base, SMALLEST_RETAINED):
-        verdict, reason = "absorbed", "numbers of the base do the same: its fit has taken it up"
-    elif not last.allowed and p is not None and p <= FAMILY_P:
-        verdict, reason = "contradicted", "its best strength has the wrong sign"
-    else:
-        verdict = "below-noise"
-        reason = named.refused.get(name, f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²")
-    return Candidate(
-        name=name, verdict=verdict, reason=reason, p_screen=p, gain_nm2=last.gain_nm2 if last else None
-    )
+        return "confusable", f"cannot be told from {sets[name]}, which was added"
+    if any(one.cause.name == name and one.reason for one in closed.chosen.checked):
+        return "resembles", refused
+    if last is None:
+        return "not-testable", "not screened"
+    if count < FEWEST_SCANS:
+        return "too-few-scans", f"{count} scans to choose and confirm on, at least {FEWEST_SCANS} needed"
+    if last.beside_base < SMALLEST_RETAINED:
+        return "not-testable", "on these layouts it changes nothing that single scans do not"
+    if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
+        return "absorbed", "numbers of the base do the same: its fit has taken it up"
+    if not last.allowed and named.family_p[name] <= FAMILY_P:
+        return "contradicted", "its best strength has the wrong sign"
+    gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
+    return "below-noise", refused or gained

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -31,8 +32,6 @@ from litho_models.loop.single_scans import SingleScans
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
-_HOLDS = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
-_FEWEST_PIXELS = 1024
 Nested = Literal["folds", "prints"]
 # What is made of a closed loop before it is written: its record, and records to be written beside it.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
@@ -84,8 +83,9 @@ def close_loop(
         "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
+    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
     with (
-        whole_folder(out, *_HOLDS, record=CloseLoop.FILE_NAME, facts=facts) as folder,
+        whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
     ):
         study = Study((), dealt(development, folds, seed), seed, places, report)
@@ -104,11 +104,7 @@ def close_loop(
             rows, often = _nested(development, chosen.model, study, nested)
             errors += rows
         if open_lock_box and locked:
-            for stage, fit, maps in held_out.of_others(locked):
-                errors += error_rows(
-                    locked, maps, model=stage, measurement="shared", held_out="locked", numbers=fit.numbers,
-                    seed=seed,
-                )  # fmt: skip
+            errors += _judged([(held_out, locked)], locked, "locked", seed)
 
         report("looking at what single scans add")
         maps = held_out.maps_um(closed.final)
@@ -122,7 +118,7 @@ def close_loop(
             run=run_info([seed], len(development), dropped),
             dataset=opened.dataset_id,
             base_model=chosen.name,
-            measurement=fit_with_measurement(closed.final.twin, closed.original, seed)[1],
+            measurement=fit_with_measurement(closed.final.twin, closed.original, seed).measurement,
             planted=planted,
             settings=settings,
             split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
@@ -144,15 +140,14 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
         InputError: fewer than two to develop on.
     """
     scans = store.scans()
-    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
-    kept = {scan.id for scan in usable}
-    dropped = [one.id for one in scans if one.id not in kept]
+    dropped = [scan.id for scan in scans if np.count_nonzero(scan.usable) < 1024]
+    usable = [scan for scan in scans if scan.id not in dropped]
     locked = [scan for scan in usable if scan.id in store.locked_ids]
     development = [scan for scan in usable if scan.id not in store.locked_ids]
     if len(development) < 2:
         got = f"{len(development)} usable and not locked"
         raise InputError("scans to close the loop on", got=got, wanted="at least 2")
-    return development, locked, [f"{one}: fewer than {_FEWEST_PIXELS} measured pixels" for one in dropped]
+    return development, locked, [f"{one}: fewer than 1024 measured pixels" for one in dropped]
 
 
 def dealt(scans: Sequence[PrintedScan], folds: int, seed: int) -> np.ndarray:
@@ -184,26 +179,36 @@ def _nested(
         if nested == "folds"
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
-    close_again = _again(base, study)
-    maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
+    close_again, often = _again(base, study), Counter[str]()
+
+    def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
+        for number, out in enumerate(parts, 1):
+            study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
+            closed = close_again([scan for scan in scans if scan.id not in out])
+            often.update(closed.final.twin.names)
+            yield HeldOut(closed, study), [scan for scan in scans if scan.id in out]
+
+    return _judged(anew(), scans, f"nested {nested}", study.seed), dict(often)
+
+
+def _judged(
+    found: Iterable[tuple[HeldOut, Sequence[PrintedScan]]],
+    scans: Sequence[PrintedScan],
+    held_out: str,
+    seed: int,
+) -> list[ErrorRow]:
+    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
+    maps: dict[Stage, dict[str, np.ndarray]] = {}
     numbers: dict[Stage, tuple[int, int]] = {}
-    often: dict[str, int] = {}
-    for number, out in enumerate(parts, 1):
-        study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
-        closed = close_again([scan for scan in scans if scan.id not in out])
-        for name in closed.final.twin.names:
-            often[name] = often.get(name, 0) + 1
-        judged = [scan for scan in scans if scan.id in out]
-        for stage, fit, own in HeldOut(closed, study).of_others(judged):
-            maps[stage].update({scan.id: one for scan, one in zip(judged, own, strict=True)})
-            numbers[stage] = max(fit.numbers, numbers.get(stage, fit.numbers))
+    for models, out in found:
+        for stage, count, own in models.of_others(out):
+            maps.setdefault(stage, {}).update(zip([scan.id for scan in out], own, strict=True))
+            numbers[stage] = max(count, numbers.get(stage, count))
     rows = []
     for stage, known in maps.items():
-        rows += error_rows(
-            scans, [known[one] for one in ids], model=stage, measurement="shared",
-            held_out=f"nested {nested}", numbers=numbers[stage], seed=study.seed,
-        )  # fmt: skip
-    return rows, often
+        terms = {"model": stage, "measurement": "shared", "held_out": held_out}
+        rows += error_rows(scans, [known[scan.id] for scan in scans], numbers[stage], seed, **terms)
+    return rows
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:

@@ -6,9 +6,11 @@ Its strength is one for all scans or one by group. Of each scan only inner produ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +19,15 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.loop.fits import ALL_FREE, State, Study
-from litho_models.loop.model import Twin, finished
+from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
 # Of a direction's information, what must survive the projections for a test to mean anything.
 SMALLEST_RETAINED = 1e-5
-# A strength on the wrong side of its null counts as noise if it is smaller than this share of the largest.
-_NOISE_SHARE = 0.3
 PERMUTATIONS = 199
+_Key = tuple[str, tuple[tuple[str, float], ...]]
 
 
 @dataclass(frozen=True)
@@ -36,47 +37,51 @@ class Trial:
     effect: Effect
     sets: tuple[Mapping[str, float], ...]
 
-    def values(self, multiples: np.ndarray) -> dict[str, float]:
-        """Parameter values for these multiples of the amplitudes, within their ranges."""
-        values = dict(self.effect.off_values())
-        for multiple, trial in zip(multiples, self.sets, strict=True):
-            for name, value in trial.items():
-                facts = self.effect.parameters[name]
-                if facts.kind == "amplitude":
-                    values[name] += float(multiple) * (value - facts.null)
-                else:
-                    values[name] = value
-        return values
+    @cached_property
+    def _facts(self) -> np.ndarray:
+        """Of each amplitude null, lowest and highest value, and distance of an ordinary one from the null."""
+        facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
+        return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
-    def sizes(self, multiples: np.ndarray) -> dict[str, float]:
-        """Of each amplitude its distance from its null, in those of ordinary values."""
-        values = self.values(multiples)
-        named = {n for trial in self.sets for n in trial} & set(self.effect.amplitudes)
-        facts = {name: self.effect.parameters[name] for name in named}
-        return {n: abs(values[n] - f.null) / abs(f.typical - f.null) for n, f in facts.items()}
+    def steps(self, multiples: np.ndarray) -> np.ndarray:
+        """How far these multiples of the sets take each amplitude (amplitudes,) from its null."""
+        return multiples @ _steps(self.effect, self.sets)
+
+    def sizes(self, multiples: np.ndarray) -> np.ndarray:
+        """The same without signs, in those of ordinary values."""
+        return np.abs(self.steps(multiples)) / self._facts[3]
 
     def allowed(self, multiples: np.ndarray, largest: float = 0.0) -> bool:
         """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there.
 
         Noise is what is small beside the largest amplitude, or beside ``largest``, that of any group.
         """
-        values, sizes = self.values(multiples), self.sizes(multiples)
-        facts = {name: self.effect.parameters[name] for name in sizes}
-        wrong = [
-            n for n, f in facts.items() if (values[n] < f.null <= f.lower) or (values[n] > f.null >= f.upper)
-        ]
-        return not any(sizes[n] > _NOISE_SHARE * max(largest, *sizes.values()) for n in wrong)
+        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
+        wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
+        sizes = self.sizes(multiples)
+        return not (sizes[wrong] > 0.3 * max(largest, sizes.max())).any()
 
     def reach(self, multiples: np.ndarray) -> float:
         """Share of the step that stays within the ranges: a straight line from the null overshoots."""
-        values, share = self.values(multiples), 1.0
-        for name in self.effect.amplitudes:
-            facts = self.effect.parameters[name]
-            step = values[name] - facts.null
-            room = (facts.upper if step > 0 else facts.lower) - facts.null
-            if abs(room) < abs(step) and room != 0:
-                share = min(share, room / step)
-        return share
+        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
+        room = np.where(steps > 0, upper, lower) - null
+        beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
+        return float(np.min(room[beyond] / steps[beyond], initial=1.0))
+
+    def start(self, multiples: np.ndarray) -> dict[str, float]:
+        """Values from which a fit begins, no farther from the null than the largest trial."""
+        null, lower, upper, _ = self._facts
+        largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
+        steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
+        values = np.clip(null + steps, lower, upper).tolist()
+        amplitudes = dict(zip(self.effect.amplitudes, values, strict=True))
+        return {**self.effect.off_values(), **self.sets[0], **amplitudes}
+
+
+def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
+    """How far each set takes each amplitude from its null, (sets, amplitudes)."""
+    nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
+    return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
 
 @dataclass(frozen=True)
@@ -114,17 +119,8 @@ class Screened:
         return len(self.columns) * len(self.multiples)
 
     def start(self) -> dict[str, dict[str, float]]:
-        """Values by label from which a fit begins, no farther from the null than the largest trial."""
-        found = {}
-        for label, multiples in self.multiples.items():
-            values = self.trial.values(multiples * self.trial.reach(multiples))
-            for name in self.trial.effect.amplitudes:
-                facts = self.trial.effect.parameters[name]
-                far = max(abs(trial.get(name, facts.null) - facts.null) for trial in self.trial.effect.trials)
-                step = min(max(values[name] - facts.null, -far), far)
-                values[name] = min(max(facts.null + step, facts.lower), facts.upper)
-            found[label] = values
-        return found
+        """Values by label from which a fit begins."""
+        return {label: self.trial.start(own) for label, own in self.multiples.items()}
 
 
 def trials_of(effects: Sequence[Effect]) -> list[Trial]:
@@ -133,16 +129,16 @@ def trials_of(effects: Sequence[Effect]) -> list[Trial]:
     A second trial of the same amplitudes at the same shape is another size: what an effect does when it is
     large need not be a multiple of what it does when it is small.
     """
-    found = []
+    found: list[Trial] = []
     for effect in effects:
-        by_shape: dict[tuple[object, ...], list[Mapping[str, float]]] = {}
+        sizes: Counter[object] = Counter()
+        together: dict[object, list[Mapping[str, float]]] = {}
         for trial in effect.trials:
             shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
-            size = 0
-            while any(set(other) == set(trial) for other in by_shape.get((shape, size), [])):
-                size += 1
-            by_shape.setdefault((shape, size), []).append(trial)
-        found += [Trial(effect, tuple(own)) for own in by_shape.values()]
+            alike = shape, frozenset(trial)
+            together.setdefault((shape, sizes[alike]), []).append(trial)
+            sizes[alike] += 1
+        found += [Trial(effect, tuple(own)) for own in together.values()]
     return found
 
 
@@ -151,40 +147,33 @@ class Secants:
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._placed, self._windows = twin.placed(), windows
-        self._known: dict[tuple[str, tuple[object, ...]], list[NDArray[np.float32]]] = {}
+        self._known: dict[_Key, list[NDArray[np.float32]]] = {}
 
     def learn(self, trials: Sequence[Trial]) -> None:
         """Compute what is not known yet."""
-        new = {
-            (trial.effect.name, tuple(values.items())): trial.effect.with_values(values)
-            for trial in trials
-            for values in trial.sets
-        }
-        new = {key: values for key, values in new.items() if key not in self._known}
+        new = [key for key in _keys(trials) if key not in self._known]
         self._known |= {key: [] for key in new}
         for window in self._windows if new else ():
-            chain = self._placed.chain(window)
-            base = self._placed.base_height(chain, window)
-            here = finished(chain, base, window)
-            for (name, at), values in new.items():
-                moved = self._placed.chain(window, {name: values})
-                same = get_effect(name).acts_on == "height"
-                height = base if same else self._placed.base_height(moved, window)
-                change = window.at_sample(finished(moved, height, window) - here)
-                self._known[name, at].append(change.astype(np.float32))
+            base = self._placed.base_height(self._placed.exposed(window), window)
+            here = self._placed.height(window, base_um=base)
+            for name, values in new:
+                effect = get_effect(name)
+                known = base if effect.acts_on == "height" else None
+                moved = self._placed.height(window, {name: effect.with_values(dict(values))}, known)
+                self._known[name, values].append(window.at_sample(moved - here).astype(np.float32))
 
     def of(self, trials: Sequence[Trial], number: int) -> list[NDArray[np.float32]]:
         """Changes (n,), µm, in one window, a row for each set of each trial."""
-        return [
-            self._known[trial.effect.name, tuple(values.items())][number]
-            for trial in trials
-            for values in trial.sets
-        ]
+        return [self._known[key][number] for key in _keys(trials)]
 
     def free_terms(self, number: int) -> np.ndarray:
         """Orthonormal basis (n, k) of what one window may add by itself."""
         window = self._windows[number]
         return orthonormal(window.terms_at_sample(self._placed.height(window), ALL_FREE).T)
+
+
+def _keys(trials: Sequence[Trial]) -> list[_Key]:
+    return [(trial.effect.name, tuple(values.items())) for trial in trials for values in trial.sets]
 
 
 class Screening:
@@ -193,37 +182,35 @@ class Screening:
     Args:
         state: the model so far; ``study``: its scans; ``effects``: candidates, none of them in the model.
         secants: at another model, near enough to tell what is worth fitting; by default at the state.
+        kept: numbers of the model that residual and columns are not freed of.
     """
 
-    def __init__(self, state: State, study: Study, effects: Sequence[Effect], secants: Secants | None = None):
+    def __init__(
+        self,
+        state: State,
+        study: Study,
+        effects: Sequence[Effect],
+        secants: Secants | None = None,
+        kept: Collection[int] = (),
+    ):
         self.study = study
         self.trials = trials_of(effects)
-        self._own = len(state.twin.vector)
         secants = secants or Secants(state.twin, study.windows)
         secants.learn(self.trials)
-        count = 1 + self._own + sum(len(trial.sets) for trial in self.trials)
-        grams = np.empty((len(study.scans), count, count))
-        raw = np.zeros(count)
-        for at in range(len(study.scans)):
-            columns = [state.held_out_um[at], *state.linear[at].jacobian, *secants.of(self.trials, at)]
-            stacked, basis = np.column_stack(columns), secants.free_terms(at)
+        own = len(state.twin.vector)
+        grams, raw = [], np.array(1e-300)
+        for at, (left, part) in enumerate(zip(state.held_out_um, state.linear, strict=True)):
+            stacked = np.column_stack([left, *part.jacobian, *secants.of(self.trials, at)])
             whole = stacked.T @ stacked / len(stacked)
-            grams[at] = whole - gram_inside(stacked, basis) / len(stacked)
-            raw += np.diag(whole)
-        own = [Block((1 + i,)) for i in range(self._own)]
-        self._raw = np.maximum(raw, 1e-300)
-        self._beside_base = np.einsum("sii->i", grams) / self._raw
-        self.freed = Products(grams, study.groups).freed_of(own).grams
-        self._retained = np.einsum("sii->i", self.freed) / self._raw
-
-    @cached_property
-    def columns(self) -> list[tuple[int, ...]]:
-        """Of each trial, its columns in the inner products."""
-        found, at = [], 1 + self._own
-        for trial in self.trials:
-            found.append(tuple(range(at, at + len(trial.sets))))
-            at += len(trial.sets)
-        return found
+            grams.append(whole - gram_inside(stacked, secants.free_terms(at)) / len(stacked))
+            raw = raw + np.diag(whole)
+        products = Products(np.stack(grams), study.groups)
+        self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if i not in kept]).grams
+        self._beside_base, self._retained = (
+            np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)
+        )
+        ends = np.cumsum([1 + own, *(len(trial.sets) for trial in self.trials)]).tolist()
+        self.columns = [tuple(range(*pair)) for pair in pairwise(ends)]
 
     @cached_property
     def candidates(self) -> list[Screened]:
@@ -239,14 +226,15 @@ class Screening:
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Alignment of what two candidates change, pooled over scans."""
-        groups = self.study.groups
-        inner = np.zeros((2, 2))
-        for scan, gram in enumerate(self.freed):
-            vectors = np.zeros((2, len(gram)))
-            for row, one in zip(vectors, (a, b), strict=True):
-                row[list(one.columns)] = one.multiples[groups[one.by][scan]]
-            inner += vectors @ gram @ vectors.T
+        one, other = self._change(a), self._change(b)
+        inner = np.einsum("asi,sij,bsj->ab", [one, other], self.freed, [one, other], optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
+
+    def _change(self, one: Screened) -> np.ndarray:
+        """Multiples of all columns, (scans, columns), in what a candidate changes."""
+        found = np.zeros(self.freed.shape[:2])
+        found[:, one.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
+        return found
 
     def permutation_p(self, one: Screened) -> float:
         """See ``permutation_p``."""
@@ -267,7 +255,7 @@ class Screening:
 
     def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Screened:
         gains, multiples = self._gains(trial, columns, self.study.groups[by])
-        largest = max(max(trial.sizes(own).values()) for own in multiples.values())
+        largest = max(trial.sizes(own).max() for own in multiples.values())
         return Screened(
             trial=trial,
             by=by,

@@ -16,16 +16,18 @@ from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart
-from litho_models.loop.regrouping import NEARLY, regrouped
-from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening, Secants
-from litho_models.scan_terms.grouped import ALL
+from litho_models.loop.screening import (
+    SMALLEST_RETAINED,
+    Screened,
+    Screening,
+    Secants,
+    gains_by,
+    permutation_p,
+)
+from litho_models.scan_terms.grouped import ALL, Labels
 
-MOST_EFFECTS = 8
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
 WORTH_FITTING = 0.3
-# Rivals are fitted beside the best if they promise this share of its gain, and change much the same.
-RIVAL_SHARE, RIVAL_COSINE = 0.3, 0.5
-RIVALS = 3
 # What changes the held-out prediction so alike cannot be told apart by its shape.
 SAME_COSINE = 0.8
 
@@ -66,12 +68,16 @@ class Found:
     def names(self) -> list[str]:
         return [cause.name for cause in self.causes]
 
+    def screened(self, name: str) -> Screened | None:
+        """What was last known of a candidate; None if it never was one."""
+        return self.last.get(name) or self.first.get(name)
+
 
 def search(
     start: State,
     study: Study,
     candidates: Sequence[Effect],
-    most: int = MOST_EFFECTS,
+    most: int = 8,
     secants: Secants | None = None,
 ) -> Found:
     """Add effects to a fitted model, at most so many.
@@ -135,28 +141,57 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: 
 
 
 def _by_group(found: Found, study: Study) -> None:
-    """Let the strength of the cause that was just added differ by group, if that is confirmed."""
-    cause = found.causes[-1]
-    other = regrouped(found.state, cause.name, study)
-    if other is None:
+    """Let the strength of the cause that was just added differ by group, if that is confirmed.
+
+    The derivative where the effect stands says more than the one at its null, by which it was screened.
+    """
+    cause, twin = found.causes[-1], found.state.twin
+    slots = {
+        at: slot
+        for at, slot in enumerate(twin.slots, twin.own)
+        if slot.effect == cause.name and slot.facts.kind == "amplitude"
+    }
+    freed = Screening(found.state, study, (), kept=slots).freed
+
+    def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return gains_by(freed, study.fold_of, [1 + at for at in slots], labels)
+
+    groups = {by: labels for by, labels in study.groups.items() if by != ALL}
+    gains = {by: float(gained(labels)[0].mean()) for by, labels in groups.items()}
+    by = _best_grouping(gains, {by: len(set(labels)) for by, labels in groups.items()})
+    if by is None:
         return
-    by, p, twin = other
-    state = fit_state(twin, study, from_here=True)
+    p = permutation_p(study, groups[by], gains[by], lambda labels: gained(labels)[0])
+    if p > EXCHANGED_P:
+        return
+    known = twin.values({})[cause.name]
+    starts = {label: dict(known) for label in groups[by]}
+    for label, steps in gained(groups[by])[1].items():
+        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
+            value = known[slot.parameter] + step
+            starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
+    other = twin.without(cause.name).with_effect(cause.name, by, starts)
+    state = fit_state(other, study, from_here=True)
     if judge(found.state.freed_nm2, state.freed_nm2, study).p <= GROUPED_P:
         study.report(f"{cause.name} differs by {by}")
         found.causes[-1] = replace(cause, by=by, group_p=p)
         found.state = state
 
 
+def _best_grouping(gains: Mapping[str, float], numbers: Mapping[str, int]) -> str | None:
+    """The grouping that gains most; of those that do nearly as well the one with the fewest numbers."""
+    most = max(gains.values(), default=0.0)
+    close = [by for by, gain in gains.items() if gain >= 0.95 * most > 0]
+    return min(close, key=lambda by: (numbers[by], -gains[by]), default=None)
+
+
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """Those that promise about as much as the best, and change much the same."""
+    """The three that promise most beside the best, a third of its gain or more, and change much the same."""
     return [
         one
         for one in standing
-        if one is not best
-        and one.gain_nm2 >= RIVAL_SHARE * best.gain_nm2
-        and abs(screening.cosine(best, one)) >= RIVAL_COSINE
-    ][:RIVALS]
+        if one is not best and one.gain_nm2 >= 0.3 * best.gain_nm2 and abs(screening.cosine(best, one)) >= 0.5
+    ][:3]
 
 
 def _alike(
@@ -209,16 +244,12 @@ def _grouped(
     own: Sequence[Screened], common: Screened, screening: Screening, mse_nm2: float
 ) -> Screened | None:
     """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
-    groups = [one for one in own if one.by != ALL]
     least = max(common.gain_nm2, 0.0) + 0.01 * mse_nm2
-    better = [one for one in groups if one.allowed and one.gain_nm2 > least]
-    if not better:
-        return None
-    best = max(better, key=lambda one: one.gain_nm2)
-    # Of groupings that do nearly as well the one with the fewest numbers.
-    close = [one for one in better if one.gain_nm2 >= NEARLY * best.gain_nm2]
-    best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
-    return best if screening.permutation_p(best) <= EXCHANGED_P else None
+    better = {one.by: one for one in own if one.by != ALL and one.allowed and one.gain_nm2 > least}
+    by = _best_grouping(
+        {by: one.gain_nm2 for by, one in better.items()}, {by: one.numbers for by, one in better.items()}
+    )
+    return None if by is None or screening.permutation_p(better[by]) > EXCHANGED_P else better[by]
 
 
 def _fitted(state: State, entering: Sequence[Screened], study: Study) -> dict[str, State]:

@@ -32,13 +32,7 @@ from litho_models.scan_terms import (
     parameter_names,
     terms_of_effect,
 )
-from litho_models.scoring.statistics import by_print, one_sided_flip_p
-
-_DATUM: Terms = frozenset({"offset"})
-_SMOOTH: Terms = frozenset({"offset", "bow"})
-# A period of lines is looked for at all frequencies at once.
-_PERIOD_P = 1e-3
-_DRAWS = 2000
+from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
 
 
 @dataclass(frozen=True)
@@ -70,14 +64,16 @@ class SingleScans:
 
     def findings(self) -> list[ScanFinding]:
         """Each effect of single scans given those that were seen before it; offsets of lines come last."""
-        accepted, found = _DATUM, []
+        accepted: Terms = frozenset({"offset"})
+        found: list[ScanFinding] = []
         names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
         lines = [name for name in names if line_terms(terms_of_effect(name))]
         for name in names:
             if name not in lines:
                 found.append(self._of_terms(name, accepted))
-                accepted |= terms_of_effect(name) if found[-1].seen else _DATUM
-        return found + self._of_lines(lines, accepted | _SMOOTH)
+                if found[-1].seen:
+                    accepted |= terms_of_effect(name)
+        return found + self._of_lines(lines, accepted | {"bow"})
 
     def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> Freed:
         blocks = Blocks(seed=self.study.seed)
@@ -96,17 +92,14 @@ class SingleScans:
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
         # Where scans of one print are alike, the printer may have done it too.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
-        return ScanFinding(
-            name=name,
-            title=effect.title,
+        spread = zip(effect.parameters.items(), values.T, strict=True)
+        return ScanFinding.of(
+            name,
+            _evidence(judgement, before, after),
             role="undetermined" if unclear else effect.role,
             seen=judgement.passed(),
-            evidence=_evidence(judgement, before, after),
             p=judgement.p,
-            spread={
-                parameter: self._spread(column, effect.parameters[parameter].unit)
-                for parameter, column in zip(effect.parameters, values.T, strict=True)
-            },
+            spread={parameter: self._spread(own, facts.unit) for (parameter, facts), own in spread},
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
@@ -124,9 +117,9 @@ class SingleScans:
     def _spread(self, values: np.ndarray, unit: str) -> Strength:
         """Standard deviation over scans with its bootstrap interval."""
         count = len(values)
-        draws = np.random.default_rng(self.study.seed).integers(0, count, (_DRAWS, count))
-        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975])
-        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(float(low), float(high)))
+        draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
+        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
+        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
         """Offsets of lines, along the scan and along the layout: against columns, then against each other.
@@ -158,12 +151,10 @@ class SingleScans:
             deviation = np.sqrt(np.maximum(gains[name], 0).mean()) / NM_PER_UM
             taken = f"{gains[name].mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
             found.append(
-                ScanFinding(
-                    name=name,
-                    title=get_effect(name).title,
-                    role=get_effect(name).role,
+                ScanFinding.of(
+                    name,
+                    "; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
                     seen=not reasons,
-                    evidence="; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
                     p=excess_p,
                     spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
                     confusable_with=[] if beaten or better else [other],
@@ -188,7 +179,10 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """The period that the means of lines have in common, such as that of mains hum, in words."""
+        """The period that the means of lines have in common, such as that of mains hum, in words.
+
+        It is looked for at all frequencies at once.
+        """
         (term,) = line_terms(terms_of_effect(name))
         means = []
         for scan, residual in zip(self.scans, self._smooth_um, strict=True):
@@ -197,7 +191,7 @@ class SingleScans:
             count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
             means.append(total / np.maximum(count, 1))
         found = line_period(means, self.scans[0].stored.pitch_um)
-        if found is None or found.p > _PERIOD_P:
+        if found is None or found.p > 1e-3:
             return ""
         share = 100 * found.share
         return (
@@ -209,7 +203,7 @@ class SingleScans:
     def _smooth_um(self) -> list[np.ndarray]:
         """Residual (y, x) of each scan without datum and bow, 0 where not measured."""
         return [
-            freed_um(scan.stored.height_um, own, scan.usable, _SMOOTH)
+            freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)
         ]
 

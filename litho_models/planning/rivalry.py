@@ -259,7 +259,7 @@ class Rivalry:
 
 
 def _chain(twin: Twin) -> EffectChain:
-    return twin.placed().of_labels({}).requires_grad_(False)
+    return twin.placed().of_labels().requires_grad_(False)
 
 
 def _inner(field: Tensor) -> Tensor:

@@ -125,6 +125,11 @@ class Products:
     grams: np.ndarray
     groups: Mapping[str, Labels]
 
+    @classmethod
+    def ungrouped(cls, grams: np.ndarray) -> Products:
+        """Of scans that all columns have one strength for."""
+        return cls(grams, {ALL: ("",) * len(grams)})
+
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
         """Of each block, by label, the strengths (columns,) that fit these scans best; ``scans``: numbers.
 

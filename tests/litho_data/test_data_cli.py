@@ -9,6 +9,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from litho_data.cli.app import app
+from litho_data.store import open_store
 from tests.litho_data.campaigns import card_text
 
 run = CliRunner()
@@ -38,6 +39,14 @@ def test_the_commands_on_a_store(own_campaign: Path) -> None:
     exported = run.invoke(app, ["export", store, "--format", "zip"])
     assert exported.exit_code == 0, exported.output
     assert (own_campaign / "prints.zarr.zip").is_file()
+    pairs, back = str(own_campaign / "pairs"), str(own_campaign / "back.zarr")
+    for words in (
+        ["export", store, "--format", "pairs", "--out", pairs],
+        ["import-pairs", pairs, "--out", back],
+    ):
+        done = run.invoke(app, words)
+        assert done.exit_code == 0, done.output
+    assert [one.id for one in open_store(back).scans()] == ["P11", "P12", "P21"]
     (own_campaign / "scans" / "P11.txt").write_text("1 2\n3 4\n")
     changed = run.invoke(app, ["verify", store])
     assert changed.exit_code == 1

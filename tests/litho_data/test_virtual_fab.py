@@ -180,7 +180,9 @@ class TestGeometry:
         scan = scan_job(fab(), job)
         margin = round(14 * 128 / 512)
         assert scan.height_um.shape == (128 + 2 * margin,) * 2
-        np.testing.assert_array_equal(scan.height_um[margin:-margin, margin:-margin], scan.clean_um)
+        seen = scan.height_um[margin:-margin, margin:-margin]
+        # Cubic interpolation at whole positions: rounding only.
+        np.testing.assert_allclose(seen, scan.clean_um, rtol=0, atol=1e-12)
         np.testing.assert_allclose(scan.frame.scan_to_layout[:2, 2], -margin * 0.1, atol=1e-12)
 
     def test_stated_warp_is_the_one_applied(self):

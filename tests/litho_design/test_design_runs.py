@@ -26,6 +26,7 @@ from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
+from litho_design.tasks import run as tasks_run
 from litho_design.tasks.design import Design, read_array
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
@@ -238,6 +239,35 @@ def test_the_estimate_of_a_resumed_run_leaves_out_what_is_done():
     assert budget.total_seconds(search, done=60) == 94
     assert "40 more iterations" in budget.sentence(search, done=60)
     assert "100 iterations" in budget.sentence(search)
+    # What comes after the search is waited for as well.
+    assert budget.model_copy(update={"seconds_after": 146.0}).total_seconds(search, done=60) == 240
+    assert "about 4.0 min" in budget.model_copy(update={"seconds_after": 146.0}).sentence(search, done=60)
+
+
+def test_what_comes_after_a_search_is_a_score_for_each_draw_and_print(
+    tiny_settings, make_printer, tiny_target, monkeypatch
+):
+    """By a clock that each print moves by 2 s and each draw of the yield by 0.5 s."""
+    printer = make_printer(tiny_settings.layout)
+    task = HologramTask(tiny_settings, printer, inputs={"target": tiny_target.pixels}, ensemble=[printer])
+    now = [0.0]
+
+    def takes(seconds, run):
+        def timed(*given):
+            now[0] += seconds
+            return run(*given)
+
+        return timed
+
+    monkeypatch.setattr(tasks_run, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(Printer, "forward", takes(2.0, Printer.forward))
+    monkeypatch.setattr(task, "window_scores", takes(0.5, task.window_scores))
+    parameters = task.free_parameters()
+    level = parameters.cells(parameters.best_levels())
+    draws = tiny_settings.window.yield_draws
+    # Two layouts by two models, each printed and scored.
+    after_s = tasks_run._seconds_after(task, level)
+    assert after_s == pytest.approx(2 * 2 * 2.0 + (draws + 2 * 2) * 0.5 + tasks_run._PAGE_S)
 
 
 def test_a_finished_folder_is_reused_and_a_foreign_one_refused(

@@ -9,8 +9,7 @@ import pytest
 
 from litho_models.effects import get_effect
 from litho_models.loop import checking
-from litho_models.loop.adequacy import reshaped_gain
-from litho_models.loop.checking import FORM_SHARE, Check
+from litho_models.loop.checking import FORM_SHARE, Check, reshaped_gain
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import judge
 from litho_models.loop.search import Cause

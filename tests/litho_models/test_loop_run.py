@@ -29,7 +29,7 @@ from litho_models.loop.errors import REPORTED, HeldOut, error_rows
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import CloseLoop, Explained
-from litho_models.loop.report import effect_text, measurement_text, verdict_text
+from litho_models.loop.report import said
 from litho_models.loop.results import _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, dealt
 from litho_models.loop.saving import save_model
@@ -228,10 +228,10 @@ def test_texts_follow_the_verdict(closed) -> None:
         "too-few-scans": f"at least {result.fewest_scans} scans",
     }
     for verdict, text in words.items():
-        assert text in verdict_text(result.model_copy(update={"verdict": verdict, "effects": []}))
-    assert result.measurement.levelling != "none" or "not levelled" in measurement_text(result)
+        assert text in said("verdict", result.model_copy(update={"verdict": verdict, "effects": []}))
+    assert result.measurement.levelling != "none" or "not levelled" in said("measurement", result.measurement)
     for one in result.effects:
-        assert one.name in effect_text(one)
+        assert one.name in said("effect", one)
 
 
 # Laws of the parts, without the fab.

@@ -131,7 +131,7 @@ def test_trials_of_one_shape_and_size_are_fitted_together() -> None:
 
 def test_multiples_count_from_the_null_and_stay_in_range() -> None:
     trial = Trial(_effect(), _effect().trials[:2])
-    assert trial.values(np.array([2.0, 3.0])) == pytest.approx({"a": 0.2, "b": 1.6, "length_um": 0.5})
+    assert trial.steps(np.array([2.0, 3.0])) == pytest.approx([0.2, 0.6])
     assert trial.reach(np.array([2.0, 3.0])) == 1
     # a would be 2, twice what it can be.
     assert trial.reach(np.array([20.0, 1.0])) == pytest.approx(0.5)

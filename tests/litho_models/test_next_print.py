@@ -423,7 +423,7 @@ def second_round(
             )
             one = prepare_scans([scan])[0]
             with torch.no_grad():
-                height = chain(one.layout, one.context)[0, 0].numpy()
+                height = chain(one.context.layout_um, one.context)[0, 0].numpy()
             scans += with_heights([scan], [height + 0.006 * rough / rough.std()])
     return scans
 

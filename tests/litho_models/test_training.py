@@ -336,7 +336,7 @@ def test_an_epoch_of_quadrants_sees_each_once():
 def test_the_paper_recipe_is_the_papers():
     for name, rate in PAPER_LEARNING_RATE.items():
         config = TrainingConfig.of_recipe("paper", name)
-        assert (config.optimiser, config.loss, config.batch, config.schedule) == ("adam", "l1", 4, "constant")
+        assert (config.optimiser, config.batch, config.schedule) == ("adam", 4, "constant")
         # 72 crops in batches of 4 are 18 steps per epoch, 4,000 epochs.
         assert config.steps == 72_000
         assert config.learning_rate == rate
@@ -417,7 +417,7 @@ def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch
     # Unequal weights of the crops: a mean of means would show.
     scans[0].valid[:, :40] = False
     config = TrainingConfig(batch=4, crop_px=32)
-    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0, "uniform")
+    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
 
     def of_process(rank, count):
         torch.manual_seed(0)
