@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.residuals import Residuals
@@ -128,7 +129,7 @@ class SpreadAnalysis(Record):
 class Stated(NamedTuple):
     """What is said of the residual of one scan: its scale at each pixel, nm, and the shape over it."""
 
-    scale_nm: np.ndarray
+    scale_nm: Array
     tails: Tails
 
 
@@ -188,7 +189,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 
 
 def calibrate(
-    name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[np.ndarray], stated: Sequence[Stated]
+    name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
     """Judge a stated spread on every scan; pixels first, then scans."""
     rows = []
@@ -225,14 +226,14 @@ def calibrate(
 
 def _bins(
     scans: Sequence[PrintedScan],
-    places: Sequence[dict[str, np.ndarray]],
-    residuals_nm: Sequence[np.ndarray],
+    places: Sequence[dict[str, Array]],
+    residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> list[SigmaBin]:
     """All pixels, each level, and ranges of equal count of what else the spread depends on."""
     used = [np.isfinite(residual) for residual in residuals_nm]
 
-    def pooled(maps: Sequence[np.ndarray]) -> np.ndarray:
+    def pooled(maps: Sequence[Array]) -> Array:
         return np.concatenate([field[use] for field, use in zip(maps, used, strict=True)])
 
     residual = pooled(residuals_nm)
@@ -246,7 +247,7 @@ def _bins(
     ]
     prints = [scan.print_id for scan in scans]
 
-    def judged(covariate: str, low: float, high: float, mine: np.ndarray) -> SigmaBin:
+    def judged(covariate: str, low: float, high: float, mine: Array) -> SigmaBin:
         coverage = [float(within[mine].mean()) for within in inside]
         intervals = [pixel_interval(within[mine], owner[mine], prints) for within in inside]
         return SigmaBin(
@@ -290,7 +291,7 @@ def conformal_factor(factors: Sequence[float], level: float = CONFORMAL_LEVEL) -
     return None if rank > len(factors) else float(np.sort(factors)[rank - 1])
 
 
-def _sample(residual: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
+def _sample(residual: Array, seed: int) -> tuple[Array, ...]:
     """Row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import POLICIES, Blocks, CrossFit, cross_fit
@@ -32,7 +33,7 @@ class PrintGain(NamedTuple):
 
 
 def print_gain(
-    height_um: np.ndarray, prediction_um: np.ndarray, used: np.ndarray, *, block_px: int = Blocks().block_px
+    height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
     """Least-squares line through the used pixels of a scan.
 
@@ -71,7 +72,7 @@ def print_gain(
     )
 
 
-def scan_errors(scan_id: str, height_um: np.ndarray, prediction_um: np.ndarray, free: CrossFit) -> ScanErrors:
+def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
     """Score one prediction against one scan, (ny, nx) µm each, on the pixels that ``cross_fit`` scores.
 
     Slope and intercept, the gain and offset of the print, are those of ``print_gain``.
@@ -99,7 +100,7 @@ def scan_errors(scan_id: str, height_um: np.ndarray, prediction_um: np.ndarray, 
     )
 
 
-def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[np.ndarray]) -> float:
+def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
     """Mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
     fits = (
         cross_fit(scan.height_um, height, scan.valid, POLICIES["offset"])
