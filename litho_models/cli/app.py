@@ -1,7 +1,5 @@
 """``litho-models``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """`litho-models noise`: what no model of the printer can predict."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

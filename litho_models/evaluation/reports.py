@@ -1,7 +1,5 @@
 """``report.html`` of an evaluation and of a benchmark."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Results in words, from templates: verdicts, how errors were made, and what limits them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from litho_data.reports.page import filled

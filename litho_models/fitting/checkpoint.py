@@ -1,7 +1,5 @@
 """What a killed run needs to go on: weights, optimiser moments, the best weights, the history."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Run folders: train a model on a store, resumable."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Small models of the zoo fitted to printed scans: a window of each, derivatives in forward mode."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The card of a frozen model: what it is for, what it was made from, and how well it does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 

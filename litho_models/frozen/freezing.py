@@ -1,7 +1,5 @@
 """The process model of a run folder, written as a frozen model on its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args

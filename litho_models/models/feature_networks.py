@@ -4,8 +4,6 @@ The features have no parameters, so that such a network is fitted to single pixe
 (``litho_models.fitting.pixels``): seconds, where a network of crops takes minutes.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from itertools import pairwise
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Linear in many features of the layout: how far blurs, slopes and their products go without a network."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import combinations_with_replacement

@@ -11,8 +11,6 @@ the rate; with three new prints the rule comes close to the t test of their mean
 that is not told the spread.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

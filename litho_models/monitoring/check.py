@@ -1,7 +1,5 @@
 """``litho-models check``: does a printer still behave as its frozen model says, and when to look again."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

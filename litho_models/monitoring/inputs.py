@@ -1,7 +1,5 @@
 """What is checked against what: the scans of a store, and a reference from a store, a print or a card."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From figures of scans to a judgement of each figure: pure, without files or models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """``check.json``, and the figures it watches: one value per print of each, and how much prints differ."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 

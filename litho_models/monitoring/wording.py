@@ -1,7 +1,5 @@
 """A check in plain words, from templates: the verdict, and what its reader should know."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Is a stated spread right? Judged on prints that it was not fitted on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple

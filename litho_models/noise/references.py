@@ -1,7 +1,5 @@
 """Scans made to measure the noise: bare substrate, flat print, steps; and what they say."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

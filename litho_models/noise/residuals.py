@@ -1,7 +1,5 @@
 """Where residuals come from: a benchmark's cache (out of fold) or frozen models; several make an ensemble."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ CRPS of a Gaussian after Gneiting and Raftery 2007, doi:10.1198/0162145060000014
 turned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

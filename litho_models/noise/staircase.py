@@ -1,7 +1,5 @@
 """Step prints: where the treads are, how high the steps, and how well neighbours can be told apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """How rough one surface is: bare substrate, flat print, or the treads of a staircase."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

@@ -5,8 +5,6 @@ likelihood, with the tails of Student's t. In two stages the spread cannot flatt
 tens of scans a few covariates are all that can be known (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError

@@ -4,8 +4,6 @@ A feature is a connected part of the film or of the ground within it, of at leas
 film's height.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ it (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is 
 scans, so that datum, gain and bow of single scans count as the noise that they are to such a model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

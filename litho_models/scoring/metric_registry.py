@@ -4,8 +4,6 @@ A metric sees one scan, what the model expects of it, and the residual freed of 
 that come with the package are fields of the results; one's own are listed there under ``metrics``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args

@@ -1,7 +1,5 @@
 """The errors of one scan, over its valid pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What one scan says of the state of the printer: gain, error, and of what layout they are."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One routine that scores every model: predictions of scans in, one validated record out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

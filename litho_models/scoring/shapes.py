@@ -5,8 +5,6 @@ are those of marching squares, so a position is a linear interpolation between p
 and the roughness of the measured contour is part of the error.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

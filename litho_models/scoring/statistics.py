@@ -1,8 +1,6 @@
 """Statistics over scans, or over prints. Pixels of a scan are correlated: what is drawn, and what changes its
 sign, is a whole scan; where scans of one print share its day and batch, a whole print."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 
 import numpy as np

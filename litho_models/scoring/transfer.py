@@ -1,7 +1,5 @@
 """How an error depends on the level and on the spatial frequency."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
