@@ -170,16 +170,10 @@ def print_gains(score: ModelScores) -> Figure:
     figure = new_figure(7.0, 5.0)
     axes = figure.subplots()
     for name in sorted({row.print for row in score.scans}):
-        rows = [row for row in score.scans if row.print == name and row.slope_error is not None]
-        axes.errorbar(
-            [row.slope for row in rows],
-            [row.intercept_nm for row in rows],
-            xerr=[_SD_95 * row.slope_error for row in rows],
-            yerr=[_SD_95 * row.intercept_error_nm for row in rows],
-            fmt=".",
-            lw=0.8,
-            label=name,
-        )
+        rows = [row for row in score.scans if row.print == name]
+        figures = [(r.slope, r.intercept_nm, r.slope_error, r.intercept_error_nm) for r in rows]
+        gain, offset, of_gain, of_offset = np.array(figures, float).T
+        axes.errorbar(gain, offset, _SD_95 * of_offset, _SD_95 * of_gain, fmt=".", lw=0.8, label=name)
     axes.axvline(1.0, color="#9aa7b5", lw=0.8)
     axes.axhline(0.0, color="#9aa7b5", lw=0.8)
     axes.set(

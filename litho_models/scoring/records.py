@@ -104,14 +104,6 @@ class ScanRow(MetricValues, ScanErrors):
     scan: str
     print: str
 
-    @property
-    def line_covariance(self) -> Array | None:
-        """Covariance of slope and intercept (nm), (2, 2); None where it cannot be known."""
-        a, b, shared = self.slope_error, self.intercept_error_nm, self.slope_intercept_correlation
-        if a is None or b is None or shared is None:
-            return None
-        return np.array([[a * a, shared * a * b], [shared * a * b, b * b]])
-
 
 class ModelScores(MetricValues):
     """Everything reported about one model; means are over scans, counts are sums, intervals resample scans.
