@@ -1,7 +1,5 @@
 """``litho-models``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -106,7 +104,7 @@ def train(
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
-    from litho_models.frozen.readme import bounds_text
+    from litho_models.frozen.card import bounds_text
     from litho_models.models import fixed_numbers
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
@@ -145,7 +143,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
-    from litho_models.evaluation.tables import evaluation_verdict
+    from litho_models.evaluation.wording import evaluation_verdict
 
     result = litho_models.evaluate(
         model,

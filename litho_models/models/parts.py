@@ -3,8 +3,6 @@
 Fields are (batch, 1, y, x), relative to a full dose or height. A part may cut them by its reach.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
