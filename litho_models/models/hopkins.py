@@ -49,9 +49,10 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     """Image of a mask (b, 1, y, x), 1 where all is open; cut by the reach of the kernels."""
     reach = kernel_reach_px(optics, pitch_um)
     ny, nx = transmission.shape[-2:]
-    kind = torch.complex128 if transmission.dtype == torch.float64 else torch.complex64
-    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device, kind)
-    return imaged(transmission, spectra)[..., reach : ny - reach, reach : nx - reach]
+    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
+    # A transform spreads its roundings over the field: in double precision a tile prints what the whole does.
+    image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
+    return image.to(transmission.dtype)
 
 
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
