@@ -171,6 +171,8 @@ def _not_allowed(error: Exception) -> InputError | None:
     if isinstance(error, OSError):
         what = f"cannot use {error.filename}" if error.filename else "the system refuses"
         return InputError(what, got=error, hint=_WAYS_OUT.get(error.errno or 0, _AGAIN))
+    if "Symlink loop" in text:
+        return InputError("a link that leads to itself", got=text.partition("'")[2].rstrip("'"))
     if isinstance(error, RecursionError):
         return InputError("input", got="parts within parts, too deep", wanted="a flatter file")
     if isinstance(error, OverflowError):
