@@ -131,7 +131,7 @@ FAULTS = [
           "over_scans=over_units(list(after.by_scan_nm.values()), seed=", f"{RUN} -k errors_are_means"),
     Fault("a dead worker takes all jobs with it", "litho_data/sharing/workers.py",
           "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
-    # Of forty drawn at random, those that no test of their room saw.
+    # Of sixty drawn at random, those that no test of their room saw.
     Fault("no interval where there is one", "litho_models/scoring/statistics.py",
           "seed=seed) if enough else None", "seed=seed) if not enough else None",
           "tests/litho_models/test_metrics.py -k enough"),
@@ -162,6 +162,9 @@ FAULTS = [
     Fault("another step than the command's", "litho_models/noise/analyse.py",
           "level_height_um: float = 0.1", "level_height_um: float = 0.2",
           "tests/litho_models/test_noise.py -k one_default"),
+    Fault("scars as wide as asked stay", "litho_data/level/scars.py",
+          "min(max_width_px, ny - 2) + 1", "min(max_width_px, ny - 2)",
+          "tests/litho_data/test_level_beyond.py -k stay"),
     Fault("a warning among the results", "litho_data/cli/scan.py",
           'f"warning: {message}", err=True', 'f"warning: {message}", err=False',
           "tests/litho_data/test_cli_scan.py -k stderr"),
