@@ -165,6 +165,8 @@ FAULTS = [
     Fault("scars as wide as asked stay", "litho_data/level/scars.py",
           "min(max_width_px, ny - 2) + 1", "min(max_width_px, ny - 2)",
           "tests/litho_data/test_level_beyond.py -k stay"),
+    Fault("files that others may run", "litho_data/foundation/files.py",
+          "chmod(0o666", "chmod(0o667", "tests/litho_data/test_files.py -k umask"),
     Fault("a warning among the results", "litho_data/cli/scan.py",
           'f"warning: {message}", err=True', 'f"warning: {message}", err=False',
           "tests/litho_data/test_cli_scan.py -k stderr"),
