@@ -75,10 +75,10 @@ class HeldOut:
     def __init__(self, closed: Closed, settings: Study):
         self.closed, self.settings = closed, settings
         self.scans = [one.stored for one in closed.original]
-        # Base and corrected model, and the one between them if there are causes and laws.
+        # Base and corrected model, and the one with the causes alone if it is neither.
         self.ends: dict[Stage, State] = {"base": closed.base, "all": closed.final}
-        causes: dict[Stage, State] = {"causes": closed.chosen.named.state}
-        between = causes if closed.causes and closed.chosen.lawful.causes else {}
+        causes = closed.chosen.named.state
+        between: dict[Stage, State] = {} if causes in (closed.base, closed.final) else {"causes": causes}
         self.stages = {"base": closed.base, **between, **self.ends}
         self._by_fold = cache(self._without_folds)
 

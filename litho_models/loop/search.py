@@ -36,7 +36,7 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        values: of its parameters by label, where no model has it.
+        values: of its parameters by label, from which a table is fitted.
     """
 
     name: str
