@@ -25,7 +25,7 @@ from litho_design.holograms.settings import hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.optimisation.budget import peak_memory_gib
-from litho_design.optimisation.parameters import make_parametrisation
+from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.source import check_device, load_printer
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
@@ -81,16 +81,16 @@ def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, An
     settings = hologram_settings(changes={"layout.size_px": size_px})
     printer = load_printer(f"{zoo.PREFIX}{name}", settings.layout, device=device)
     task = HologramTask(settings, printer, inputs={"target": load_target("text", size_px).pixels})
-    parameters = make_parametrisation(settings.layout, settings.search).to(device)
+    parameters = DirectLevels(settings.layout).to(device)
     parameters.start_random(0)
-    level = parameters.sample(1.0, True, 0).detach().requires_grad_()
+    level = parameters.sample(hard=True).detach().requires_grad_()
 
     def predict() -> None:
         torch.autograd.grad(printer(level).sum(), level)
 
     def iterate() -> None:
         parameters.zero_grad(set_to_none=True)
-        task.objective(parameters.sample(1.0, True, 0))[0].backward()
+        task.objective(parameters.sample(hard=True))[0].backward()
 
     return {
         "model": name,

@@ -104,7 +104,7 @@ class Element(nn.Module):
 
     def height_um(self) -> Tensor:
         """Printed height (size, size), µm, with a gradient to the free levels."""
-        return printed_anyhow(self._print, self.free.sample(1.0, self.whole, 0))[0, 0]
+        return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
         tile = self.tile_px

@@ -36,9 +36,7 @@ def hologram_baselines(
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
     found = {"black image": _of_black(bench, target, settings)}
     limited = _free_amplitude(bench, target)
-    score = hologram_score(
-        [(1.0, bench.propagator(limited))], limited, target, bench.grid, settings.optics, settings.camera
-    )
+    score = hologram_score([(1.0, bench.propagator(limited))], limited, target, bench.grid, settings.optics)
     found["diffraction-limited"] = {name: getattr(score, name) for name in _OF_IMAGES}
     best, loss = _continuous_phase(bench, cells, target, settings, counted)
     weighted, _ = gerchberg_saxton(
@@ -46,7 +44,7 @@ def hologram_baselines(
     )
     for name, phase in (("continuous phase", best), ("weighted GS", weighted)):
         height_um = cells(phase) * (wave_um / (2 * math.pi))
-        found[name] = bench.score(height_um, target, settings.camera).model_dump()
+        found[name] = bench.score(height_um, target).model_dump()
         if counted is not None:
             seen = bench(height_um)[counted].double()
             found[name]["si_psnr_window_db"] = si_psnr_db(seen, target[counted].double())
@@ -74,7 +72,7 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
     black, wanted = torch.zeros_like(target).double(), target.double()
     figures = likeness(black, wanted, bench.resolved(wanted))
     dark = [(1.0, black.to(torch.complex128))]
-    return figures | {"ssim_camera": camera_ssim(dark, wanted, bench.grid, settings.optics, settings.camera)}
+    return figures | {"ssim_camera": camera_ssim(dark, wanted, bench.grid, settings.optics)}
 
 
 @torch.no_grad()

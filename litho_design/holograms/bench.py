@@ -12,7 +12,6 @@ from torch import Tensor
 
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
-from litho_design.holograms.settings import CameraView
 from litho_design.images.similarity import (
     SSIM_WINDOW_PX,
     light_figures,
@@ -24,6 +23,9 @@ from litho_design.images.similarity import (
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
+# A 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its own.
+_CAMERA_PITCH_UM, _CAMERA_NA = 0.345, 0.3
+
 Waves = Sequence[tuple[float, Tensor]]
 
 
@@ -31,11 +33,11 @@ class HologramBench(ElementBench):
     """The image of a holographic element, and its score."""
 
     @torch.no_grad()
-    def score(self, height_um: Tensor, target: Tensor, camera: CameraView) -> HologramScore:
+    def score(self, height_um: Tensor, target: Tensor) -> HologramScore:
         """Score printed heights (size, size), µm, against ``target`` (size, size)."""
         element = element_field(height_um, self.grid, self.optics)
         waves = list(self.waves(height_um))
-        return hologram_score(waves, element, target, self.grid, self.optics, camera)
+        return hologram_score(waves, element, target, self.grid, self.optics)
 
     def resolved(self, target: Tensor) -> Tensor:
         """``target`` (size, size) at the resolution of the element."""
@@ -70,7 +72,7 @@ class WindowedHologramScore(HologramScore):
 
 
 def hologram_score(
-    waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView
+    waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics
 ) -> HologramScore:
     """Score the waves in the image plane, whose intensities add up, against the wanted image.
 
@@ -95,7 +97,7 @@ def hologram_score(
         **likeness(share, wanted, at_resolution(wanted, grid, optics)),
         rmse_paper=float(paper_rmse(share, wanted)),
         clipped_share=float((scaled > 1).double().mean()),
-        ssim_camera=camera_ssim(waves, wanted, grid, optics, camera),
+        ssim_camera=camera_ssim(waves, wanted, grid, optics),
     )
 
 
@@ -126,15 +128,14 @@ def _added(waves: Waves) -> Tensor:
     return sum(found[1:], found[0])
 
 
-def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
+def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
     """SSIM of the light of some waves as a camera records it, against the target on its pixels."""
     import cv2
 
-    aperture = camera.numerical_aperture
     seen = _added(
-        [(share, through_aperture(wave, grid, optics.wavelength_um, aperture)) for share, wave in waves]
+        [(share, through_aperture(wave, grid, optics.wavelength_um, _CAMERA_NA)) for share, wave in waves]
     )
-    pixels = tuple(max(SSIM_WINDOW_PX, round(size / camera.pitch_um)) for size in reversed(grid.size_um))
+    pixels = tuple(max(SSIM_WINDOW_PX, round(size / _CAMERA_PITCH_UM)) for size in reversed(grid.size_um))
 
     def sample(image: Tensor) -> Tensor:
         return torch.from_numpy(

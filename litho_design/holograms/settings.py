@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from litho_data.commands.settings import changed, setting
-from litho_data.foundation.results import Record
 from litho_design.holograms.loss import HologramLoss
 from litho_design.optics import Optics
 from litho_design.optimisation.settings import (
@@ -19,22 +18,11 @@ from litho_design.optimisation.settings import (
 from litho_design.printers.layout import LayoutSettings
 
 
-class CameraView(Record):
-    """The camera that records the image: its pixel in the image plane and the aperture of its objective.
-
-    The default is a 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its own.
-    """
-
-    pitch_um: float = setting(0.345, "Pixel of the camera in the image plane", unit="µm", gt=0)
-    numerical_aperture: float = setting(0.3, "Numerical aperture of its objective", gt=0)
-
-
 class HologramSettings(DesignSettings):
     """All settings of one hologram."""
 
     search: SearchSettings = setting(SearchSettings(start="gs"), "Search")
     loss: HologramLoss = setting(HologramLoss(), "Loss")
-    camera: CameraView = setting(CameraView(), "Camera of the score")
 
 
 def hologram_settings(

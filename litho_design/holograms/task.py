@@ -22,6 +22,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
+_START_ITERATIONS = 40
+
 
 @register_task
 class HologramTask(Task):
@@ -90,7 +92,7 @@ class HologramTask(Task):
         """Levels that print the phases of ``gerchberg_saxton``, weighted for ``wgs``."""
         search = self.settings.search
         phase, _ = gerchberg_saxton(
-            self.bench.propagator, self.target, self.cells, iterations=search.start_iterations,
+            self.bench.propagator, self.target, self.cells, iterations=_START_ITERATIONS,
             weighted=search.start == "wgs", seed=search.seed, level_phase=level_phase, counted=self.counted,
             total=self.total,
         )  # fmt: skip
@@ -98,7 +100,7 @@ class HologramTask(Task):
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
         """Score of the image behind a print (size, size), µm."""
-        score = self.bench.score(height_um, self.target, self.settings.camera)
+        score = self.bench.score(height_um, self.target)
         if self.counted is None:
             return score
         with torch.no_grad():

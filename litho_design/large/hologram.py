@@ -35,7 +35,6 @@ _LEFT_OUT = (
 # What a large element does not have: only these values.
 ONLY: dict[str, Any] = {
     "search.parametrisation": "direct",
-    "search.start_jitter_levels": 0.0,
     "optics.element": "thin",
     "optics.source_sine": 0.0,
     "optics.bandwidth_um": 0.0,

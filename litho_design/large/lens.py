@@ -80,8 +80,7 @@ class RingLens(DirectLensTask):
         self, settings: LensSettings, printer: Printer, tile_px: int, bench: RadialLensBench | None = None
     ):
         rings = {"task": "direct", "layout.symmetry": "radial", "view.aperture": "circle"}
-        jittered = {"search.start_jitter_levels": settings.search.start_jitter_levels}
-        only(settings, ONLY | jittered | rings)
+        only(settings, ONLY | rings)
         check_printer(printer, Bands(settings.layout.size_px, settings.layout.size_px))
         self.tile_px, self._bench = tile_px, bench
         Task.__init__(self, settings, printer)

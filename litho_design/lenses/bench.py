@@ -21,6 +21,9 @@ from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
 from litho_design.optics.source import require_one_wave
 from litho_design.printers.layout import LayoutSettings
 
+# Side of the centre in the centre-to-background ratio, as in the paper.
+CENTRE_UM = 1.0
+
 
 class LensOptics(nn.Module):
     """What the benches of a plane and of rings share: aperture, focal window, the perfect lens."""
@@ -39,8 +42,8 @@ class LensOptics(nn.Module):
         return half / math.hypot(half, self.optics.distance_um)
 
     def ratio(self, psf: Tensor) -> Tensor:
-        """Centre-to-background ratio of a PSF (window, window), with the centre of the view."""
-        centre_px = round(self.view.centre_um / self.layout.pitch_um)
+        """Centre-to-background ratio of a PSF (window, window)."""
+        centre_px = round(CENTRE_UM / self.layout.pitch_um)
         return centre_to_background(psf, centre_px, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:

@@ -38,7 +38,6 @@ class LensView(Record):
 
     aperture: Literal["square", "circle"] = setting("circle", "Aperture of the lens")
     window_px: int = setting(254, "Lens: side of the PSF window", unit="px", option="--window-px", ge=16)
-    centre_um: float = setting(1.0, "Side of the centre in the centre-to-background ratio", unit="µm", gt=0)
     path: Literal["plane", "radial"] = setting("plane", "Search on the plane, or along a radius of rings")
 
 
@@ -97,7 +96,7 @@ class LensSettings(DesignSettings):
     layout: LayoutSettings = setting(LayoutSettings(size_px=1200, cell_um=0.1, symmetry="radial"), "Layout")
     optics: Optics = setting(Optics(distance_um=400.0), "Optics")
     search: SearchSettings = setting(
-        SearchSettings(start="fresnel", start_jitter_levels=0.3, iterations=200, learning_rate=0.3), "Search"
+        SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
     # A draw of a lens costs a whole plane, as much as ten steps of its search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")

@@ -64,6 +64,7 @@ class LensTask(Task):
     """
 
     starts = ("random", "fresnel")
+    start_jitter_levels = 0.3
     errors = (
         "fwhm_um",
         "mae_direct",

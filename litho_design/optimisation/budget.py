@@ -55,12 +55,12 @@ def measure_budget(
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()
-    loss, _ = objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+    loss, _ = objective(parameters.sample(search.temperature(0), seed=0))
     loss.backward()
     _wait(device)
     middle = clock()
     with torch.no_grad():
-        objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+        objective(parameters.sample(search.temperature(0), seed=0))
     _wait(device)
     for parameter in parameters.parameters():
         parameter.grad = None

@@ -16,10 +16,14 @@ if TYPE_CHECKING:
     from litho_design.printers.layout import LayoutSettings
 
 
+# Of steps and features beside the loss.
+_WEIGHT = 3.0
+
+
 class Fabrication(Record):
     """Penalties on a layout beside the loss of its light.
 
-    loss + weight * (excess of steps + height of fine features) + inside_weight * ``outside``. The first is
+    loss + 3 * (excess of steps + height of fine features) + inside_weight * ``outside``. The first is
     the mean of (step - max_step_levels)^2 over neighbouring pixels, where positive; the second what a grey
     opening and closing by ``min_feature_um`` take away along rows and columns, or along a radius of rings:
     ridges and grooves narrower than that; both relative to the highest level.
@@ -33,7 +37,6 @@ class Fabrication(Record):
         0.0, "Ridges and grooves narrower than this are penalised; 0 for none", unit="µm",
         option="--min-feature-um", ge=0,
     )  # fmt: skip
-    weight: float = setting(3.0, "Weight of steps and features", ge=0)
     inside_weight: float = setting(
         0.0, "Weight of levels and steps that the model's training layouts hardly have",
         option="--inside-weight", ge=0,
@@ -46,11 +49,11 @@ def fabrication_penalty(
     """The penalty on levels (1, 1, size, size), whole or real; None where nothing is asked for."""
     terms = []
     if settings.max_step_levels:
-        terms.append(settings.weight * _step_excess(level, settings.max_step_levels, layout.levels))
+        terms.append(_WEIGHT * _step_excess(level, settings.max_step_levels, layout.levels))
     if settings.min_feature_um:
         width = round(settings.min_feature_um / layout.pitch_um)
         rows = level[:, :, layout.size_px // 2, None] if layout.symmetry == "radial" else level
-        terms.append(settings.weight * _fine_features(rows, width, layout.levels))
+        terms.append(_WEIGHT * _fine_features(rows, width, layout.levels))
     if settings.inside_weight:
         terms.append(settings.inside_weight * outside(level, layout.levels, card))
     return sum(terms[1:], terms[0]) if terms else None

@@ -66,8 +66,7 @@ class CellMap(nn.Module):
 class GumbelLevels(nn.Module):
     """A categorical distribution over levels per cell, sampled with Gumbel-Softmax.
 
-    Jang, Gu and Poole 2017, arXiv:1611.01144; the soft sample is the expected level under the
-    sampled weights, the hard one is a level with the gradient of the soft one.
+    Jang, Gu and Poole 2017, arXiv:1611.01144; a sample is the expected level under the sampled weights.
     """
 
     # Of a learning rate: logits have no range.
@@ -79,12 +78,12 @@ class GumbelLevels(nn.Module):
         self.levels = layout.levels
         self.logits = nn.Parameter(torch.zeros(layout.levels, *self.cells.cells))
 
-    def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
+    def sample(self, temperature: float, seed: int) -> Tensor:
         """Levels on the pixels, float (1, 1, size, size); the same ``seed`` gives the same sample."""
         devices = [self.logits.device] if self.logits.is_cuda else []
         with torch.random.fork_rng(devices=devices):
             torch.manual_seed(seed)
-            weights = F.gumbel_softmax(self.logits, tau=temperature, hard=hard, dim=0)
+            weights = F.gumbel_softmax(self.logits, tau=temperature, dim=0)
         ladder = torch.arange(self.levels, dtype=weights.dtype, device=weights.device)
         return self.cells(torch.tensordot(ladder, weights, dims=1))[None, None]
 
@@ -123,7 +122,7 @@ class DirectLevels(nn.Module):
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
         self.filter_cells = layout.cell_filter_um / layout.cell_um
 
-    def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
+    def sample(self, temperature: float = 1.0, seed: int = 0, *, hard: bool = False) -> Tensor:
         """Levels on the pixels, float (1, 1, size, size); nothing here is random."""
         free, kept = self._filtered(), self._kept()
         level = free + ((kept.round() if hard else kept) - free).detach()

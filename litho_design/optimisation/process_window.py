@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.commands.settings import leaves, setting
 from litho_data.foundation.errors import InputError
@@ -21,6 +20,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
+# A print passes if no figure in dB is further below the print as modelled, and if every other one keeps this
+# share of it; an error may be its inverse.
+PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM, _STITCH_STREAM = 1, 3
 _IN_PLACE = Stitching()
 _SPREADS = (
@@ -32,14 +34,11 @@ class ProcessWindow(Record):
     """Spread of prints and optics, and how a search weighs it.
 
     ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
-    blur. A search with ``samples`` above 0 minimises mean + weight * sd of the loss over as many
-    draws (``mean-sd``), or the mean of the worst ``tail`` share of them (``cvar``); the draws are
-    the same in every iteration. The defaults are a guess: replace them by the spreads of your
-    printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
+    blur. A search with ``samples`` above 0 minimises the mean loss of the worst ``tail`` share of as many
+    draws, which are the same in every iteration. The defaults are a guess: replace them by the spreads of
+    your printer. The fields of one measured data set vary by 13 % in gain, including the scale of the
+    microscope.
     """
-
-    # Older designs also have the roughness of a print.
-    model_config = ConfigDict(extra="ignore")
 
     gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
@@ -58,21 +57,11 @@ class ProcessWindow(Record):
         option="--robust-samples",
         ge=0,
     )
-    risk: Literal["mean-sd", "cvar"] = setting(
-        "cvar",
-        "Loss over the draws: mean of the worst share (cvar), or mean + weight * standard deviation",
-        option="--risk",
+    tail: float = setting(
+        0.25, "Worst share of the draws, whose mean loss is minimised", option="--risk-tail", gt=0, le=1
     )
-    weight: float = setting(1.0, "Weight of the standard deviation for mean-sd", option="--risk-weight", ge=0)
-    tail: float = setting(0.25, "Worst share of the draws for cvar", option="--risk-tail", gt=0, le=1)
     seed: int = setting(0, "Seed of the draws")
     yield_draws: int = setting(100, "Random prints of the yield", option="--yield-draws", ge=2)
-    pass_drop_db: float = setting(
-        1.0, "A print passes if no figure in dB is further below the print as modelled", unit="dB", ge=0
-    )
-    pass_share: float = setting(
-        0.9, "and if every other figure keeps this share of it (errors: its inverse)", gt=0, le=1
-    )
 
 
 def spreads(window: ProcessWindow) -> list[str]:
@@ -181,7 +170,6 @@ class Yield(Record):
 def measure_yield(
     drawn: Sequence[Mapping[str, float]],
     modelled: Mapping[str, float],
-    window: ProcessWindow,
     errors: Collection[str] = (),
 ) -> Yield:
     """How many drawn prints pass: all figures that they share with the print as modelled stay close to it.
@@ -195,10 +183,10 @@ def measure_yield(
 
     def passes(name: str, value: float) -> bool:
         if name in errors:
-            return value <= modelled[name] / window.pass_share
+            return value <= modelled[name] / PASS_SHARE
         if name.endswith("_db"):
-            return value >= modelled[name] - window.pass_drop_db
-        return value >= modelled[name] * window.pass_share
+            return value >= modelled[name] - PASS_DROP_DB
+        return value >= modelled[name] * PASS_SHARE
 
     passed = sum(all(passes(name, one[name]) for name in figures) for one in drawn)
     interval = binomtest(passed, len(drawn)).proportion_ci(method="wilson")
@@ -208,11 +196,9 @@ def measure_yield(
     )  # fmt: skip
 
 
-def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
-    """One number for many losses: mean + weight * sd, or the mean of the worst share."""
-    if window.risk == "mean-sd":
-        return losses.mean() + window.weight * losses.std(correction=0)
-    worst = max(1, round(window.tail * losses.numel()))
+def risk(losses: Tensor, tail: float) -> Tensor:
+    """The mean of the worst share of many losses."""
+    worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
 
 

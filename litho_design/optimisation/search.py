@@ -81,7 +81,7 @@ def _step(
     # The noise follows from seed and iteration, so that a resumed run draws the same numbers.
     seed = settings.seed * 1_000_003 + iteration
     optimiser.zero_grad(set_to_none=True)
-    level = parameters.sample(settings.temperature(iteration), settings.hard(iteration), seed)
+    level = parameters.sample(settings.temperature(iteration), seed)
     loss, _ = objective(level)
     if not torch.isfinite(loss):
         raise InputError(

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
+from pydantic import model_validator
+
 from litho_data.commands.settings import changed, setting
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
@@ -34,10 +36,6 @@ class SearchSettings(Record):
         "Start of the search: random, gs or wgs (holograms), fresnel (lenses), inverse (reliefs)",
         option="--start",
     )
-    start_iterations: int = setting(40, "Iterations of the starts gs and wgs", ge=1)
-    start_jitter_levels: float = setting(
-        0.0, "Noise added to a start that is not random", unit="levels", ge=0
-    )
     iterations: int = setting(300, "Iterations of the search", option="--iterations", ge=1)
     optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
     learning_rate: float = setting(
@@ -55,9 +53,6 @@ class SearchSettings(Record):
     rate_iterations: int = setting(25, "Iterations between these times, or without a lower loss", ge=1)
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
-    hard_from: float = setting(
-        1.0, "Share of the iterations after which samples are whole levels; 1 for never", ge=0, le=1
-    )
     evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
     keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
     polish_rounds: int = setting(10, "Rounds of single-level changes after the search", ge=0)
@@ -75,10 +70,6 @@ class SearchSettings(Record):
         weight = (1 + math.cos(math.pi * share)) / 2
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
-    def hard(self, iteration: int) -> bool:
-        """Whether this iteration samples whole levels with a straight-through gradient."""
-        return iteration >= self.hard_from * self.iterations
-
 
 # The search of the paper, for holograms and lenses; each adds its own learning rate.
 PAPER_SEARCH = SearchSettings(
@@ -93,12 +84,19 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """With further models in the search, the loss is their mean or worst + weight * disagreement in waves."""
+    """With further models in the search, the loss is the worst of them + weight * disagreement in waves."""
 
-    risk: Literal["mean", "worst"] = setting("worst", "Loss over the models: their mean, or the worst")
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )
+
+
+# Settings that designs had which are to stay readable: choices that nobody made.
+_GONE = (
+    *("search.start_iterations", "search.start_jitter_levels", "search.hard_from", "ensemble.risk"),
+    *("window.risk", "window.weight", "window.pass_drop_db", "window.pass_share", "fabrication.weight"),
+    *("view.centre_um", "camera.pitch_um", "camera.numerical_aperture"),
+)
 
 
 class DesignSettings(Record):
@@ -115,6 +113,20 @@ class DesignSettings(Record):
     window: ProcessWindow = setting(ProcessWindow(), "Process window")
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
     fabrication: Fabrication = setting(Fabrication(), "What the printer can make")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_today(cls, content: Any) -> Any:
+        if not isinstance(content, dict):
+            return content
+        kept: dict[str, Any] = {}
+        for name, part in content.items():
+            left = part
+            if isinstance(part, dict):
+                left = {key: value for key, value in part.items() if f"{name}.{key}" not in _GONE}
+            if left or not part:
+                kept[name] = left
+        return kept
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:

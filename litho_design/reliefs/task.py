@@ -182,7 +182,7 @@ class ReliefTask(Task):
         optimiser = torch.optim.Adam(free.parameters(), lr=search.learning_rate * free.rate_unit)
         best, lowest = None, math.inf
         for _ in range(_FREE_ITERATIONS):
-            print_um = self.printer(free.sample(1.0, False, 0))[0, 0]
+            print_um = self.printer(free.sample())[0, 0]
             loss = self.loss(print_um)
             if float(loss.detach()) < lowest:
                 best, lowest = print_um.detach(), float(loss.detach())

@@ -96,9 +96,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     shown = [name for name in draws[0] if name in design.predicted]
     chosen = [name for name in task.headline if name in shown][:2] or shown[:2]
     figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
-    add_yield(
-        page, draws, window, figures, measure_yield(draws, design.predicted, window, task.errors), task.errors
-    )
+    add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, task.errors), task.errors)
     page.heading("Printed height of the levels", folded=True)
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))

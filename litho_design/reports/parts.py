@@ -10,7 +10,7 @@ import numpy as np
 from litho_data.foundation.results import Record
 from litho_data.reports.page import Page, capitalised
 from litho_data.reports.pictures import new_figure
-from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
+from litho_design.optimisation.process_window import PASS_DROP_DB, PASS_SHARE, ProcessWindow, Yield, spreads
 from litho_design.reports.advice import (
     distribution_warning,
     named,
@@ -78,12 +78,12 @@ def add_yield(
         f"deviations: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
-    grown = f", an error grows to {100 / window.pass_share:.0f} % at most"
+    grown = f", an error grows to {100 / PASS_SHARE:.0f} % at most"
     grown = grown if set(errors) & set(passed.figures) else ""
     page.paragraph(
         f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
-        f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
-        f"{100 * window.pass_share:g} % of it{grown}. Judged by {', '.join(map(named, passed.figures))}."
+        f"is more than {PASS_DROP_DB:g} dB below the print as modelled, every other one keeps "
+        f"{100 * PASS_SHARE:g} % of it{grown}. Judged by {', '.join(map(named, passed.figures))}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)

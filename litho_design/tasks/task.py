@@ -56,7 +56,7 @@ class Task:
 
     Attributes:
         name: in results; one for every task.
-        starts: starts of the search that make sense.
+        starts: starts of the search that make sense; ``start_jitter_levels``: noise that they get.
         headline: figures that reports and commands show first; all of them where empty.
         errors: figures that are better when lower.
         polished, reported: whether the search ends with single-level changes, and the run with a page.
@@ -69,8 +69,7 @@ class Task:
         settings: geometry, optics, search, process window.
         printer: frozen model, or nominal heights.
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models: the loss is the worst over all, or the mean, plus a penalty on what they
-            disagree about.
+        ensemble: further models: the loss is the worst over all, plus a penalty on what they disagree about.
         record: where the inputs come from.
 
     Raises:
@@ -79,6 +78,7 @@ class Task:
 
     name: ClassVar[str]
     starts: ClassVar[tuple[str, ...]] = ("random",)
+    start_jitter_levels = 0.0
     headline: ClassVar[tuple[str, ...]] = ()
     errors: ClassVar[tuple[str, ...]] = ()
     score_type: ClassVar[type[Record]] = Figures
@@ -266,14 +266,14 @@ class Task:
         else:
             phase = printed_phase(self.printer.level_heights_um(), optics).to(self.printer.device)
             levels = self.start_levels(phase).float()
-            parameters.start_from(levels, jitter_levels=search.start_jitter_levels, seed=search.seed)
+            parameters.start_from(levels, jitter_levels=self.start_jitter_levels, seed=search.seed)
         return parameters
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        Of several models their mean, or the worst of them, and their disagreement; over samples of the
-        process window its risk; then the penalties on what the printer can make.
+        Of several models the worst of them, and their disagreement; over samples of the process window its
+        risk; then the penalties on what the printer can make.
         """
         settings, prints = self.settings, [self.search_print(level, n) for n in range(len(self.printers))]
         losses: list[Tensor] = []
@@ -283,11 +283,11 @@ class Task:
             found = [self.loss_and_parts(bench(height)) for height in drawn]
             parts = parts or found[0][1]
             of_models = torch.stack([loss for loss, _ in found])
-            losses.append(of_models.max() if settings.ensemble.risk == "worst" else of_models.mean())
+            losses.append(of_models.max())
         loss = losses[0]
         if len(losses) > 1:
             together = torch.stack(losses)
-            loss = risk(together, settings.window)
+            loss = risk(together, settings.window.tail)
             parts = {"mean": float(together.detach().mean()), "worst": float(together.detach().max())}
         if len(prints) > 1 and settings.ensemble.weight:
             apart_um = disagreement_um(torch.stack(prints), self.search_area())

@@ -57,8 +57,8 @@ def design_hologram(
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
         judges: models, MODEL or NAME=MODEL, that print the finished layout, the width of the design; those of
             the zoo that were trained on the same prints by default.
-        robust: search through the judges as well, as far as they have gradients: for the lowest worst (or
-            mean: ``ensemble.risk``) loss, plus a penalty on the models' disagreement.
+        robust: search through the judges as well, as far as they have gradients: for the lowest worst loss,
+            plus a penalty on the models' disagreement.
         band_px: rows of a band at most: designs in bands, for elements beyond the memory of a process. Those
             that torchrun starts share them; with ``cuda`` each takes a GPU of its own. The one model has a
             finite reach then, and nothing else prints the layout.

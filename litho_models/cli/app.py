@@ -22,6 +22,7 @@ from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
+from litho_models.cli.board import board
 from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
@@ -32,6 +33,7 @@ app.command()(noise)
 app.command()(check)
 zoo = typer.Typer(help="The models that come with the package: list, or show NAME.", no_args_is_help=True)
 app.add_typer(zoo, name="zoo")
+app.add_typer(board, name="board")
 
 ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME")]
 StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]

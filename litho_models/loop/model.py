@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
@@ -261,12 +260,16 @@ class Placed:
             values = twin.vector[at : at + parameter.numel()]
             parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
             at += parameter.numel()
-        self._known = cache(self.of_labels)
+        self._chains: dict[tuple[tuple[str, str], ...], EffectChain] = {}
 
     def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
         """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
         labels = tuple(self.twin.labels(scan).items())
-        return self._known(labels) if extra is None else self.of_labels(labels, extra)
+        if extra is not None:
+            return self.of_labels(labels, extra)
+        if labels not in self._chains:
+            self._chains[labels] = self.of_labels(labels)
+        return self._chains[labels]
 
     def of_labels(self, labels: tuple[tuple[str, str], ...] = (), extra: Values | None = None) -> EffectChain:
         """The chain for scans with these labels, by grouping; without any it has the mean strengths."""

@@ -95,7 +95,7 @@ def close_loop(
                 f"--nested with {base}", got="a model that is not fitted here", wanted="a small model's name"
             )
         closed = close(development, study.fold_of, chosen.model, study)
-        held_out = HeldOut(closed, study)
+        held_out = HeldOut(closed)
         errors = held_out.errors()
         often: dict[str, int] = {}
         left_out_nm, survives_on = held_out.left_out_nm(), held_out.survives_on(chosen.others)
@@ -187,7 +187,7 @@ def _nested(
             study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)
-            yield HeldOut(closed, study), [scan for scan in scans if scan.id in out]
+            yield HeldOut(closed), [scan for scan in scans if scan.id in out]
 
     return errors_of_others(anew(), scans, f"nested {nested}", study.seed), dict(often)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -34,7 +33,6 @@ class Screened:
         trial: what is tried; ``by``: the grouping of its strength.
         gains_nm2: (scans,) in squared error, strengths fitted without the scan's fold.
         multiples: by label, of the trial's amplitudes, from all scans.
-        columns: of the trial in the inner products.
         allowed: the strengths have a physical sign; ``retained``: share of the information that the terms of
             single scans and the model's own numbers leave, ``beside_base``: what the terms alone leave.
     """
@@ -43,7 +41,6 @@ class Screened:
     by: str
     gains_nm2: np.ndarray
     multiples: Mapping[str, np.ndarray]
-    columns: tuple[int, ...]
     allowed: bool
     retained: float
     beside_base: float
@@ -58,7 +55,7 @@ class Screened:
 
     @property
     def numbers(self) -> int:
-        return len(self.columns) * len(self.multiples)
+        return len(self.trial.sets) * len(self.multiples)
 
     def start(self) -> dict[str, dict[str, float]]:
         """Values by label from which a fit begins."""
@@ -83,10 +80,10 @@ class Screening:
         kept: Collection[int] = (),
     ):
         self.study = study
-        self.trials = trials_of(effects)
+        own = len(state.twin.vector)
+        self.trials = trials_of(effects, 1 + own)
         secants = secants or Secants(state.twin, study.windows)
         secants.learn(self.trials)
-        own = len(state.twin.vector)
         grams, raw = [], np.array(1e-300)
         for at, (left, part) in enumerate(zip(state.held_out_um, state.linear, strict=True)):
             stacked = np.column_stack([left, *part.jacobian, *secants.of(self.trials, at)])
@@ -98,16 +95,14 @@ class Screening:
         self._beside_base, self._retained = (
             np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)
         )
-        ends = np.cumsum([1 + own, *(len(trial.sets) for trial in self.trials)]).tolist()
-        self.columns = [tuple(range(*pair)) for pair in pairwise(ends)]
 
     @cached_property
     def candidates(self) -> list[Screened]:
         """The best trial of each effect in each grouping, the largest gain first."""
         found: dict[tuple[str, str], Screened] = {}
-        for trial, columns in zip(self.trials, self.columns, strict=True):
+        for trial in self.trials:
             for by in self.study.groups:
-                one = self._candidate(trial, columns, by)
+                one = self._candidate(trial, by)
                 best = found.get((one.name, by))
                 if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
                     found[one.name, by] = one
@@ -122,15 +117,13 @@ class Screening:
     def _change(self, one: Screened) -> np.ndarray:
         """Multiples of all columns, (scans, columns), in what a candidate changes."""
         found = np.zeros(self.freed.shape[:2])
-        found[:, one.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
+        found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
 
     def permutation_p(self, one: Screened) -> float:
         """See ``permutation_p``."""
         labels = self.study.groups[one.by]
-        return permutation_p(
-            self.study, labels, one.gain_nm2, lambda by: self._gains(one.trial, one.columns, by)[0]
-        )
+        return permutation_p(self.study, labels, one.gain_nm2, lambda by: self._gains(one.trial, by)[0])
 
     def family_p(self, one: Screened) -> float:
         """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
@@ -142,26 +135,27 @@ class Screening:
         gains = np.stack([one.gains_nm2 for one in self.candidates if one.by == ALL], axis=1)
         return (sign_flips(len(gains), self.study.seed) @ gains).max(axis=1)
 
-    def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Screened:
-        gains, multiples = self._gains(trial, columns, self.study.groups[by])
+    def _candidate(self, trial: Trial, by: str) -> Screened:
+        gains, multiples = self._gains(trial, self.study.groups[by])
         largest = max(trial.sizes(own).max() for own in multiples.values())
         return Screened(
             trial=trial,
             by=by,
             gains_nm2=gains,
             multiples=multiples,
-            columns=columns,
             allowed=all(trial.allowed(own, largest) for own in multiples.values()),
-            retained=float(self._retained[list(columns)].max()),
-            beside_base=float(self._beside_base[list(columns)].max()),
+            retained=float(self._retained[trial.columns].max()),
+            beside_base=float(self._beside_base[trial.columns].max()),
         )
 
-    def _gains(
-        self, trial: Trial, columns: tuple[int, ...], labels: Labels
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _gains(self, trial: Trial, labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Held-out gains (scans,) nm², and the multiples by label from all scans."""
         return gains_by(
-            self.freed, self.study.fold_of, columns, labels, lambda own: trial.allowed(own) * trial.reach(own)
+            self.freed,
+            self.study.fold_of,
+            trial.columns,
+            labels,
+            lambda own: trial.allowed(own) * trial.reach(own),
         )
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from litho_models.effects import Effect, get_effect
-from litho_models.fitting.least_squares import orthonormal
 from litho_models.loop.fits import ALL_FREE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
@@ -21,10 +20,14 @@ _Key = tuple[str, tuple[tuple[str, float], ...]]
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect of one shape and size; their amplitudes are fitted together."""
+    """Parameter sets of one effect of one shape and size; their amplitudes are fitted together.
+
+    ``columns``: where its changes stand among all that are looked at.
+    """
 
     effect: Effect
     sets: tuple[Mapping[str, float], ...]
+    columns: list[int] = field(default_factory=list)
 
     @cached_property
     def _facts(self) -> np.ndarray:
@@ -73,8 +76,8 @@ def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
 
-def trials_of(effects: Sequence[Effect]) -> list[Trial]:
-    """The trials of the effects by shape and size.
+def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
+    """The trials of the effects by shape and size, their columns from the first one on.
 
     A second trial of the same amplitudes at the same shape is another size: what an effect does when it is
     large need not be a multiple of what it does when it is small.
@@ -88,7 +91,9 @@ def trials_of(effects: Sequence[Effect]) -> list[Trial]:
             alike = shape, frozenset(trial)
             together.setdefault((shape, sizes[alike]), []).append(trial)
             sizes[alike] += 1
-        found += [Trial(effect, tuple(own)) for own in together.values()]
+        for own in together.values():
+            found.append(Trial(effect, tuple(own), list(range(first, first + len(own)))))
+            first += len(own)
     return found
 
 
@@ -119,7 +124,7 @@ class Secants:
     def free_terms(self, number: int) -> np.ndarray:
         """Orthonormal basis (n, k) of what one window may add by itself."""
         window = self._windows[number]
-        return orthonormal(window.terms_at_sample(self._placed.height(window), ALL_FREE).T)
+        return window.free_basis(self._placed.height(window), ALL_FREE)
 
 
 def _keys(trials: Sequence[Trial]) -> list[_Key]:

@@ -23,7 +23,7 @@ SIZE, BAND, ITERATIONS = 160, 32, 20
 
 def settings(iterations: int = ITERATIONS) -> HologramSettings:
     """A hologram of 16 µm at 30 µm."""
-    changes = {"layout.size_px": SIZE, "optics.distance_um": 30.0, "search.start_iterations": 4}
+    changes = {"layout.size_px": SIZE, "optics.distance_um": 30.0}
     changes |= {"search.iterations": iterations, "search.checkpoint_every": 8, "search.evaluate_every": 5}
     return hologram_settings(changes=changes)
 

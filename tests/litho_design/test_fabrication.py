@@ -18,7 +18,9 @@ LAYOUT = LayoutSettings(size_px=16, levels=13)
 
 def _penalty(rows: np.ndarray, layout: LayoutSettings = LAYOUT, card=None, **settings) -> float:
     level = torch.as_tensor(np.asarray(rows, np.float32))[None, None]
-    return float(fabrication_penalty(level, Fabrication(weight=1.0, **settings), layout, card or {}))
+    # Steps and features count three times.
+    weight = 1 if "inside_weight" in settings else 3
+    return float(fabrication_penalty(level, Fabrication(**settings), layout, card or {})) / weight
 
 
 def test_steps_above_the_cap_count_by_their_excess():

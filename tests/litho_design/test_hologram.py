@@ -11,7 +11,6 @@ import torch
 
 from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture
 from litho_design.holograms.loss import HologramLoss, hologram_loss
-from litho_design.holograms.settings import CameraView
 from litho_design.images.similarity import (
     SSIM_WINDOW_PX,
     light_figures,
@@ -74,7 +73,7 @@ def test_scores_of_a_perfect_image():
     target = torch.from_numpy(draw_target("ring", 64)).double()
     grid = centred_grid((64, 64), layout.pitch_um)
     field = (target / (target.sum() * 0.01)).sqrt().to(torch.complex128)
-    score = hologram_score([(1.0, field)], field, target, grid, Optics(), CameraView(numerical_aperture=0.95))
+    score = hologram_score([(1.0, field)], field, target, grid, Optics())
     assert score.eff_window == pytest.approx(1, rel=1e-12)
     assert score.ssim == pytest.approx(1, abs=1e-6)
     assert score.rmse_paper < 0.1  # I_avg weights by T: exact only for a binary target
@@ -87,7 +86,7 @@ def test_fully_developed_speckle_has_unit_contrast():
     target[:, :128] = 0
     speckle = torch.randn(256, 256, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
     grid = centred_grid((256, 256), 0.1)
-    score = hologram_score([(1.0, speckle)], speckle, target, grid, Optics(), CameraView())
+    score = hologram_score([(1.0, speckle)], speckle, target, grid, Optics())
     # 32768 independent samples of an exponential distribution: sd of the contrast about 0.006.
     assert score.speckle_contrast == pytest.approx(1, abs=0.03)
     # Of a target without greys both figures count the same half of the light.

@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 from litho_data.foundation.errors import InputError
 from litho_design.images.targets import draw_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.lenses.bench import LensBench, RadialLensBench, centre_to_background, sensor_psf
+from litho_design.lenses.bench import CENTRE_UM, LensBench, RadialLensBench, centre_to_background, sensor_psf
 from litho_design.lenses.score import half_maximum_width_um, lens_score, score_lens
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
 from litho_design.lenses.task import lens_task
@@ -79,11 +79,11 @@ def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
             update={
                 "layout": layout,
                 "optics": OPTICS,
-                "search": base.search.model_copy(update={"start_jitter_levels": 0.0}),
             }
         ),
         Printer(None, layout, source="none"),
     )
+    task.start_jitter_levels = 0.0
     parameters = task.free_parameters()
     height = task.printer(task.cells(parameters.best_levels())[None, None].float())[0, 0]
     strehl = lens_score(task.bench, height).strehl
@@ -120,7 +120,7 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
     assert not task.strips
     level = torch.full((1, 1, 300, 300), 3.0)
     # The objective sees the print of the element itself, not of a strip.
-    centre_px = round(settings.view.centre_um / LAYOUT.pitch_um)
+    centre_px = round(CENTRE_UM / LAYOUT.pitch_um)
     ratio = centre_to_background(task.bench(printer(level)[0, 0]), centre_px, 300)
     assert float(task.objective(level)[0]) == pytest.approx(-math.log(float(ratio)), rel=1e-6)
     assert printer.tiling_check(level, tile_px=64) is None

@@ -111,7 +111,7 @@ def test_a_yield_counts_prints_and_has_the_interval_of_a_share():
     modelled = {"si_psnr_db": 20.0, "eff_signal": 0.5, "rms_nm": 10.0, "ssim": 0.4}
     good = {"si_psnr_db": 19.1, "eff_signal": 0.46, "rms_nm": 11.0}
     bad = [good | {"si_psnr_db": 18.9}, good | {"eff_signal": 0.44}, good | {"rms_nm": 11.2}]
-    found = measure_yield([good] * 90 + bad * 3 + bad[:1], modelled, ProcessWindow(), ["rms_nm"])
+    found = measure_yield([good] * 90 + bad * 3 + bad[:1], modelled, ["rms_nm"])
     assert (found.draws, found.passed, found.share) == (100, 90, 0.9)
     # Wilson's interval of 90 in 100, as in tables.
     assert found.ci95 == pytest.approx((0.8256, 0.9448), abs=1e-4)

@@ -23,7 +23,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.workflows.design import design_lens
 
 SEARCH = {
-    "parametrisation": "gumbel", "start": "random", "keep": "last", "polish_rounds": 0, "hard_from": 1.0
+    "parametrisation": "gumbel", "start": "random", "keep": "last", "polish_rounds": 0
 }  # fmt: skip
 
 
@@ -46,7 +46,7 @@ HOLOGRAM = {
 LENS = {
     "layout.size_px": 1200, "layout.pitch_um": 0.1, "layout.level_height_um": 0.1,
     "layout.symmetry": "radial", "optics.distance_um": 400.0, "view.aperture": "square",
-    "view.path": "plane", "view.centre_um": 1.0, "imaging.iterations": 50,
+    "view.path": "plane", "imaging.iterations": 50,
 }  # fmt: skip
 PAPER = {"layout.levels": 13, "optics.wavelength_um": 0.6328, "optics.index_step": 0.548, **tau(0.5)}
 AUTHORS = {"layout.levels": 12, "optics.wavelength_um": 0.633, "optics.index_step": 0.545, **tau(1.0)}
@@ -142,7 +142,7 @@ def test_a_soft_sample_is_the_expected_level_of_equation_a2(temperature):
     noise = -torch.empty_like(parameters.logits).exponential_().log()
     weight = ((parameters.logits.detach() + noise).double() / temperature).exp()
     level = (torch.arange(13.0)[:, None, None] * weight).sum(0) / weight.sum(0)
-    sample = parameters.sample(temperature, hard=False, seed=4)[0, 0, ::4, ::4]
+    sample = parameters.sample(temperature, seed=4)[0, 0, ::4, ::4]
     # Float32 of levels up to 12.
     assert (sample - level).abs().max() < 1e-5
 

@@ -50,9 +50,8 @@ def test_a_spread_without_a_positive_wavelength_is_refused(small_settings, make_
 
 def test_risk_formulas():
     losses = torch.tensor([1.0, 2.0, 3.0, 6.0])
-    assert float(risk(losses, ProcessWindow(risk="cvar", tail=0.5))) == pytest.approx(4.5)
-    # mean 3, population variance (4 + 1 + 0 + 9) / 4 = 3.5
-    assert float(risk(losses, ProcessWindow(risk="mean-sd", weight=2))) == pytest.approx(3 + 2 * 3.5**0.5)
+    assert float(risk(losses, 0.5)) == pytest.approx(4.5)
+    assert float(risk(losses, 0.01)) == pytest.approx(6)
 
 
 def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
@@ -81,7 +80,7 @@ def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
 
 @pytest.mark.long
 def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, make_printer):
-    spread = ProcessWindow(gain_sd=0.08, blur_sd_um=0.05, defocus_sd_um=2.0, samples=6, risk="mean-sd")
+    spread = ProcessWindow(gain_sd=0.08, blur_sd_um=0.05, defocus_sd_um=2.0, samples=6)
     search = small_settings.search.model_copy(update={"iterations": 60})
     nominal = small_settings.model_copy(update={"search": search})
     robust = nominal.model_copy(update={"window": spread})
@@ -96,5 +95,5 @@ def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, 
         )
         height = torch.from_numpy(np.load(tmp_path / name / HEIGHT_FILE))
         losses = torch.tensor([score["loss"] for score in judge.window_scores(height, 24)])
-        risks[name] = float(risk(losses, spread))
+        risks[name] = float(risk(losses, spread.tail))
     assert risks["robust"] < risks["nominal"]

@@ -28,7 +28,7 @@ def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
         # Soft samples to the end: a score of them would fall far below that of the printable layout.
         settings = SearchSettings(
             parametrisation=parametrisation, keep=keep, iterations=iterations, evaluate_every=1,
-            learning_rate=0.3, temperature_start=1.0, temperature_end=1.0, hard_from=1.0,
+            learning_rate=0.3, temperature_start=1.0, temperature_end=1.0,
         )  # fmt: skip
         parameters = make_parametrisation(LAYOUT, settings)
         parameters.start_random(0)

@@ -230,3 +230,18 @@ def test_help_needs_no_torch():
         "sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_designs_with_choices_that_are_gone_stay_readable():
+    """And nothing else that is unknown is taken in silence."""
+    now = hologram_settings().model_dump(mode="json")
+    older = {
+        **now,
+        "search": {**now["search"], "start_iterations": 40, "hard_from": 1.0},
+        "window": {**now["window"], "risk": "cvar", "weight": 1.0},
+        "camera": {"pitch_um": 0.345, "numerical_aperture": 0.3},
+    }
+    assert HologramSettings.model_validate(older) == hologram_settings()
+    for strange in ({"camera": {"pitch_px": 3}}, {"search": {"start_iteration": 4}}, {"flash": True}):
+        with pytest.raises(ValueError, match="Extra inputs are not permitted"):
+            HologramSettings.model_validate(now | strange)

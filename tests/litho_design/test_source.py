@@ -10,7 +10,6 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings, load_design
 from litho_design.holograms.bench import HologramBench
-from litho_design.holograms.settings import CameraView
 from litho_design.large.hologram import ONLY, only
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.settings import LensView
@@ -76,7 +75,7 @@ def test_scores_add_up_the_light_of_the_source(height):
     contrast, power = {}, {}
     for sine in (0.0, 0.1):
         optics = OPTICS.model_copy(update={"source_sine": sine})
-        score = HologramBench(LAYOUT, optics).score(height, target, CameraView())
+        score = HologramBench(LAYOUT, optics).score(height, target)
         contrast[sine], power[sine] = score.speckle_contrast, score.eff_signal
     assert contrast[0.1] < 0.6 * contrast[0.0]
     assert power[0.1] == pytest.approx(power[0.0], rel=0.3)
