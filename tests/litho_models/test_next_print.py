@@ -270,8 +270,8 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
         for owner in ("printer", "microscope"):
             own = rival("slope-thinning", nearly_equal, owner)
             covariance = np.zeros((len(own.vector),) * 2)
-            # The loss along y; the power of the slope comes last.
-            covariance[-2, -2] = sd_um**2
+            # The loss along y; the power of the slope and its direction come last.
+            covariance[-3, -3] = sd_um**2
             rivals.append(own.model_copy(update={"covariance": covariance.tolist()}))
         asked = slope_question(rivals=rivals)
         [pair] = _pairs(Rivalry(asked, base_model(), Printing(0.1, 0.1, 12), white()), prints)
