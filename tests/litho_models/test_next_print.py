@@ -66,7 +66,7 @@ from tests.litho_models.loop_scans import base_model, blank_scans, planted, stud
 from tests.litho_models.prints import write_store
 from tests.tables import require_tables_equal_record
 
-SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
+SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0, "turn_deg": 0.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
 NOISE_NM = 10.0
 DOCS = Path(__file__).parents[2] / "docs"
