@@ -110,9 +110,9 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
         order, draw = np.arange(4), np.random.default_rng(seed)
         size = draw.normal(size=(4, 4)) / (1 + order[:, None] ** 2 + order**2)
         turn = draw.uniform(0, 2 * np.pi, (4, 4))
-        surface = sum(
-            size[i, j] * np.cos(2 * np.pi * (i * y + j * x) + turn[i, j]) for i, j in np.ndindex(4, 4)
-        )
+        y, x = y[..., None, None], x[..., None, None]
+        waves = np.cos(2 * np.pi * (order[:, None] * y + order * x) + turn)
+        surface = (size * waves).sum((-2, -1))
         surface = (surface - surface.min()) / np.ptp(surface)
     return (high_um * surface).astype(np.float32)
 
