@@ -2,7 +2,7 @@
 
     python -m benchmarks.fan_out [--publish]
 
-The element is 19.2 µm wide, a spot two diffraction limits from the next. Power and evenness of the spots are
+The element is 12.8 µm wide, a spot two diffraction limits from the next. Power and evenness of the spots are
 those of the printed layout: for nominal heights, and through Physics of the zoo as its printer. Beside it are
 a continuous phase by the same loss, and Gerchberg-Saxton, its phase as it is and on the nearest of 13 levels.
 """
@@ -29,7 +29,7 @@ from litho_design.optimisation.phases import gerchberg_saxton, nearest_levels, p
 PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
 RESULT = PAGE.parent / "results" / "fan-out" / "fan_out.json"
 NAME = "fan-out"
-SIZE_PX, PITCH_UM, LIMITS_APART = 192, 0.1, 2
+SIZE_PX, PITCH_UM, LIMITS_APART = 128, 0.1, 2
 # lambda f / D is 0.3 µm, three pixels of the image.
 FOCAL_UM = 0.3 * SIZE_PX * PITCH_UM / 0.6328
 SETTINGS = {
@@ -38,9 +38,9 @@ SETTINGS = {
     "optics.distance_um": FOCAL_UM,
     "optics.propagation": "far-field",
     "search.start": "gs",
-    "search.iterations": 200,
+    "search.iterations": 150,
     "search.learning_rate": 0.5,
-    "search.polish_rounds": 100,
+    "search.polish_rounds": 50,
     "window.yield_draws": 2,
     "window.defocus_sd_um": 0.0,
 }
