@@ -29,7 +29,8 @@ ROOMS = {
     ),
     "litho_models": (
         "layers", "simulator", "prediction", "models", "scan_terms", "effects", "splits",
-        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning", "cli",
+        "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning",
+        "boards", "cli",
     ),
     "litho_design": (
         "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",

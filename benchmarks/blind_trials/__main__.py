@@ -16,23 +16,17 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from benchmarks.blind_trials.campaign import (
-    finished,
-    make_draws,
-    open_campaign,
-    run_campaign,
-    run_one,
-)
-from benchmarks.blind_trials.records import Board
-from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish_scoreboard, trial_table
+from benchmarks.blind_trials.campaign import finished, open_campaign, run_campaign, run_one
+from benchmarks.blind_trials.publishing import publish_scoreboard
 from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
+from litho_models.boards.board import BASE, make_draws
+from litho_models.boards.figures import figure_lines, make_scoreboard, trial_table
+from litho_models.boards.records import Board
 
 # Announced before any of their trials is run; development uses other seeds.
 ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20271}
-# The printers of single causes are Physics models; mixtures have others too, so there the bases compete.
-BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
@@ -91,8 +85,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
     if arguments.publish:
         publish_scoreboard(PAGE, scoreboard)
         scoreboard.write(results_of(board, seed))
-    for what, value, wanted in figures_of(scoreboard):
-        print(f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else ""))
+    print(*figure_lines(scoreboard), sep="\n")
     print(f"all trials: {out / 'scoreboard.csv'}")
 
 

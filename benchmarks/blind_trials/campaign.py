@@ -10,25 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.blind_trials.draws import draw_board
-from benchmarks.blind_trials.records import Board, Draw, Draws, Trial
-from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
+from benchmarks.blind_trials.trial import run_trial, trial_folder
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import ONE_THREAD, Workers, run_jobs
-from litho_data.virtual_fab.jobs import Plan
+from litho_models.boards.board import name_of, trial_line
+from litho_models.boards.judging import failed
+from litho_models.boards.records import Draw, Draws, Trial
 
 _ROOT = Path(__file__).parents[2]
-
-
-def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
-    """The draws of a board.
-
-    Raises:
-        InputError: settings that cannot be drawn, or fields that cannot be printed.
-    """
-    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
-    trials = draw_board(board, seed)
-    return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
 
 
 def open_campaign(out: Path, draws: Draws) -> None:
@@ -50,7 +39,7 @@ def open_campaign(out: Path, draws: Draws) -> None:
 
 def finished(out: Path, draws: Draws) -> list[Trial]:
     """The trials that have come to an end, failed ones included, in the order drawn."""
-    folders = (trial_folder(out, draw.number) for draw in draws.trials)
+    folders = (trial_folder(out, draw) for draw in draws.trials)
     return [Trial.read(folder) for folder in folders if (folder / Trial.FILE_NAME).exists()]
 
 
@@ -81,7 +70,7 @@ def run_campaign(
     jobs = [_Job(out, draw, timeout_s, options) for draw in todo]
     results = run_jobs(_run_apart, jobs, workers, name=lambda job: f"trial {job.draw.number}", apart=True)
     for place, (_, (trial, seconds)) in enumerate(results, 1):
-        print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
+        print(f"[{place}/{len(todo)}] {trial_line(trial)} ({seconds:.0f} s)", flush=True)
 
 
 def run_one(out: Path, number: int, *, measured: Path | None, keep_data: bool) -> None:
@@ -105,10 +94,10 @@ class _Job(NamedTuple):
 def _run_apart(job: _Job) -> tuple[Trial, float]:
     """Run a trial in a process of its own; what it prints goes to a log beside its result."""
     out, draw, timeout_s, options = job
-    folder, clock = trial_folder(out, draw.number), time.monotonic()
+    folder, clock = trial_folder(out, draw), time.monotonic()
     command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
     command += ["--run-one", str(draw.number), *options]
-    log = out / "logs" / f"{draw.number:02d}.txt"
+    log = out / "logs" / f"{name_of(draw)}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w", encoding="utf-8") as stream:
         try:
@@ -127,12 +116,3 @@ def _run_apart(job: _Job) -> tuple[Trial, float]:
     if not (folder / Trial.FILE_NAME).exists():
         failed(draw, reason).write(folder)
     return Trial.read(folder), time.monotonic() - clock
-
-
-def _line(trial: Trial) -> str:
-    causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
-    false = [f"false: {name}" for name in trial.false_names]
-    ratio = trial.errors and trial.errors.ratio
-    errors = [f"{ratio:.2f} × the true models"] if ratio else []
-    reason = [trial.failure] if trial.failure else []
-    return f"trial {trial.draw.number}: {', '.join([*causes, *false, *errors, *reason])}"

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.blind_trials.planting import noise_free_um
-from benchmarks.blind_trials.records import Draw, Planted
 from litho_data.foundation.errors import InputError
 from litho_data.store import Store
 from litho_data.virtual_fab import Job, Printer
+from litho_models.boards.planting import noise_free_um
+from litho_models.boards.records import Draw, Planted
 
 
 def measured_jobs(store: Store) -> tuple[Job, ...]:

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.blind_trials.judging import bias_of, false_names, found_by, judge, true_floor
 from benchmarks.blind_trials.measured import inject, measured_jobs, middle
-from benchmarks.blind_trials.planting import plant, trial_jobs, write_raw
-from benchmarks.blind_trials.records import Draw, Draws, Outcome, Planted, Trial, TrialErrors
 from litho_data.foundation.errors import InputError
 from litho_data.making.build import build_dataset
 from litho_data.store import open_store
+from litho_models.boards.board import TRIALS, cpu_s, name_of
+from litho_models.boards.judging import failed, judged
+from litho_models.boards.own_loop import answer_of
+from litho_models.boards.planting import plant, trial_jobs, write_raw
+from litho_models.boards.records import Draw, Draws, Planted, Trial
 from litho_models.loop.run import close_loop
 
 
-def trial_folder(out: Path, number: int) -> Path:
+def trial_folder(out: Path, draw: Draw) -> Path:
     """Where the loop works on a trial and its result goes."""
-    return out / "trials" / f"{number:02d}"
+    return out / TRIALS / name_of(draw)
 
 
 def run_trial(
@@ -43,7 +44,7 @@ def run_trial(
         keep_data: keep raw files and store, which the draw makes again.
         report: told what happens, a sentence at a time.
     """
-    folder = trial_folder(out, draw.number)
+    folder = trial_folder(out, draw)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     planted: list[Planted] = []
@@ -56,36 +57,19 @@ def run_trial(
             opened = open_store(measured)
             jobs = measured_jobs(opened)
             planted = plant(draw, middle(jobs, draws.size_px))
-            started_s = _cpu_s()
+            started_s = cpu_s()
             inject(opened, store, draw, planted, jobs)
         else:
             jobs = trial_jobs(draw, draws.n_scans, draws.size_px)
             planted = plant(draw, jobs)
             card = write_raw(draw, planted, jobs, folder / "raw")
-            started_s = _cpu_s()
+            started_s = cpu_s()
             build_dataset(card, store)
         result = close_loop(store, folder / "loop", base=draws.base, report=report)
-        used_s = _cpu_s() - started_s
+        used_s = cpu_s() - started_s
         report("judging")
-        locked = set(result.split.lock_box)
-        scans = [scan for scan in open_store(store).scans() if scan.id not in locked]
-        before, after = result.error("base"), result.error("all")
-        assert before is not None
-        assert after is not None
-        floor = (
-            None if draw.kind == "measured" else true_floor(draw, planted, jobs, scans, result.run.seeds[0])
-        )
-        trial = Trial(
-            draw=draw,
-            planted=planted,
-            outcomes=judge(draw, planted, result, jobs, scans),
-            false_names=false_names(planted, result),
-            found=found_by(result),
-            verdict=result.verdict,
-            base_model=result.base_model,
-            errors=TrialErrors(before_nm=before.mae_nm, after_nm=after.mae_nm, floor_nm=floor),
-            bias=bias_of(draw, result),
-            dataset_cpu_s=used_s,
+        trial = judged(draw, planted, answer_of(result), jobs, open_store(store), used_s).model_copy(
+            update={"verdict": result.verdict, "base_model": result.base_model}
         )
     except Exception as error:
         traceback.print_exc()
@@ -96,19 +80,3 @@ def run_trial(
             shutil.rmtree(folder / data, ignore_errors=True)
     trial.write(folder)
     return trial
-
-
-def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
-    """The result of a trial that did not come to an end."""
-    names = [one.name for one in draw.causes] or ["none"]
-    return Trial(
-        draw=draw,
-        planted=planted or [],
-        outcomes=[Outcome(name=name, verdict="failed") for name in names],
-        failure=" ".join(reason.split()),
-    )
-
-
-def _cpu_s() -> float:
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)

@@ -11,12 +11,15 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import parsed
+from litho_data.foundation.names import PlainName
 from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 
+# Of a value that is shown.
+_LONGEST = 80
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
 
@@ -89,8 +92,9 @@ def _file_patterns(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 def _inside(value: str) -> str:
     """A relative path that stays in the data folder, with either kind of separator."""
     parts = PurePosixPath(value.replace("\\", "/")).parts
-    if not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value):
-        raise ValueError("wanted a path that stays inside the data folder")
+    leaves = not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value)
+    if leaves or not value.isprintable():
+        raise ValueError("wanted a path that stays inside the data folder, of characters that can be read")
     return value
 
 
@@ -105,6 +109,7 @@ def _id_pattern(value: str) -> str:
 
 
 Length = Annotated[float, Field(strict=True), AfterValidator(_positive)]
+Uncertainty = Annotated[float, Field(strict=True, ge=0, le=LENGTH_UM.high, allow_inf_nan=False)]
 FilePatterns = Annotated[str | tuple[str, ...], AfterValidator(_file_patterns)]
 KnownFormat = Annotated[str, AfterValidator(_known_format)]
 KnownUnit = Annotated[str, AfterValidator(_known_unit)]
@@ -190,7 +195,7 @@ class Standard(Record):
     """A scan of something whose size is known; how to read it is that of the scans unless stated here."""
 
     file: InsidePath
-    uncertainty_um: float = Field(ge=0, allow_inf_nan=False)
+    uncertainty_um: Uncertainty
     format: KnownFormat | None = None
     unit: KnownUnit | None = None
     size_um: tuple[Length, Length] | None = None
@@ -239,7 +244,7 @@ class KnownGrating(Record):
     """The grating that scans of the use ``grating`` show: period along both axes, from its certificate."""
 
     period_um: Length
-    uncertainty_um: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    uncertainty_um: Uncertainty = 0.0
 
 
 class Planned(Record):
@@ -258,7 +263,7 @@ class Source(Record):
 class Card(Record):
     """A dataset card, checked."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: PlainName = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     title: str = ""
     license: str = ""
     citation: str = ""
@@ -290,13 +295,20 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "value_error":
         # The message of our own validators; for a table it already names the key.
         cause = first["ctx"]["error"]
-        shown = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"
+        shown = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
         return InputError(f"{what}: {key}{shown}: {cause}")
     if first["type"] == "tuple_type":
         given = first["input"]
         numbers = f"[{given}, {given}]" if isinstance(given, int | float) else "[54.0, 54.0]"
-        return InputError(f"{what}: {key} = {given!r}", got="one value", wanted=f"y and x, such as {numbers}")
+        return InputError(
+            f"{what}: {key} = {_shown(given)}", got="one value", wanted=f"y and x, such as {numbers}"
+        )
     return InputError(f"{what}: {first_error(error)}")
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:

@@ -1,7 +1,5 @@
 """``litho-models``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +20,7 @@ from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
+from litho_models.cli.board import board
 from litho_models.cli.loop import check, close_loop, next_print
 from litho_models.cli.noise import noise
 
@@ -32,6 +31,7 @@ app.command()(noise)
 app.command()(check)
 zoo = typer.Typer(help="The models that come with the package: list, or show NAME.", no_args_is_help=True)
 app.add_typer(zoo, name="zoo")
+app.add_typer(board, name="board")
 
 ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME")]
 StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]
@@ -99,7 +99,7 @@ def train(
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
-    from litho_models.frozen.readme import bounds_text
+    from litho_models.frozen.card import bounds_text
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
     run = litho_models.train(
@@ -135,7 +135,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
-    from litho_models.evaluation.tables import evaluation_verdict
+    from litho_models.evaluation.wording import evaluation_verdict
 
     result = litho_models.evaluate(
         model,

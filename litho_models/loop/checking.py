@@ -18,8 +18,8 @@ from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, Study, held_out_maps, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, search
+from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the

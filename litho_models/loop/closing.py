@@ -24,8 +24,8 @@ from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, 
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans, prepared_among
-from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable
+from litho_models.loop.trials import Secants
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.measurement_fit import learn_measurement
 

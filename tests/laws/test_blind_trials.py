@@ -17,7 +17,17 @@ from scipy.optimize import curve_fit
 
 from benchmarks.blind_trials import campaign
 from benchmarks.blind_trials.__main__ import PAGE, RESULTS, main
-from benchmarks.blind_trials.draws import (
+from benchmarks.blind_trials.measured import inject, measured_jobs, middle
+from benchmarks.blind_trials.publishing import as_markdown, mark_of, publish_scoreboard
+from benchmarks.blind_trials.trial import run_trial, trial_folder
+from benchmarks.record import published
+from litho_data.foundation.errors import InputError
+from litho_data.sharing.workers import Workers
+from litho_data.store import PrintedScan, open_store
+from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_models.boards.board import make_draws
+from litho_models.boards.draws import (
     BASE_RMS_NM,
     GROUPED,
     LINEAR,
@@ -29,10 +39,11 @@ from benchmarks.blind_trials.draws import (
     draw_board,
     names_of,
 )
-from benchmarks.blind_trials.judging import bias_of, false_names, judge, true_floor
-from benchmarks.blind_trials.measured import inject, measured_jobs, middle
-from benchmarks.blind_trials.other_forms import FORMS, FormCause
-from benchmarks.blind_trials.planting import (
+from litho_models.boards.figures import figures_of, make_scoreboard, share, trial_table
+from litho_models.boards.judging import bias_of, failed, false_names, judge, true_floor
+from litho_models.boards.other_forms import FORMS, FormCause
+from litho_models.boards.own_loop import answer_of
+from litho_models.boards.planting import (
     fab_of,
     noise_free_um,
     plant,
@@ -42,7 +53,8 @@ from benchmarks.blind_trials.planting import (
     trial_jobs,
     write_raw,
 )
-from benchmarks.blind_trials.records import (
+from litho_models.boards.records import (
+    Answer,
     CauseDraw,
     Draw,
     Draws,
@@ -53,22 +65,6 @@ from benchmarks.blind_trials.records import (
     Trial,
     TrialErrors,
 )
-from benchmarks.blind_trials.scoreboard import (
-    as_markdown,
-    figures_of,
-    make_scoreboard,
-    mark_of,
-    publish_scoreboard,
-    share,
-    trial_table,
-)
-from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
-from benchmarks.record import published
-from litho_data.foundation.errors import InputError
-from litho_data.sharing.workers import Workers
-from litho_data.store import PrintedScan, open_store
-from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
-from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.loop.record import Candidate, CloseLoop, Explained, FoundEffect, ScanFinding, Strength
 from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
 from litho_models.scan_terms.measurement import MeasurementModel, SharedPart
@@ -145,7 +141,7 @@ def test_the_drawing_reads_no_catalogue():
     """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
     rooms = ("litho_models.effects", "litho_models.loop")
     code = (
-        "import sys, benchmarks.blind_trials.draws, benchmarks.blind_trials.planting\n"
+        "import sys, litho_models.boards.draws, litho_models.boards.planting\n"
         f"print(*(m for m in sys.modules if m.startswith({rooms})))"
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
@@ -336,9 +332,11 @@ def said(
     parts: Sequence[SharedPart] = (),
     seen: Sequence[str] = (),
     **more: str,
-) -> CloseLoop:
-    """What the loop would write; ``seen`` in single scans, ``more``: verdicts of candidates (_ for -)."""
-    return CloseLoop.model_construct(
+) -> Answer:
+    """What the loop would say; ``seen`` in single scans, ``more``: verdicts of candidates (_ for -)."""
+    result = CloseLoop.model_construct(
+        base_model="",
+        errors=[],
         effects=list(effects),
         candidates=[
             Candidate.model_construct(name=name.replace("_", "-"), verdict=own) for name, own in more.items()
@@ -351,6 +349,7 @@ def said(
         measurement=MeasurementModel(levelling="none", parts=list(parts), field_um=(9, 9), scans=4),
         verdict=verdict,
     )
+    return answer_of(result)
 
 
 SHARED, THINNING = ["noticed", "set-contains-it"], ["slope-thinning"]
@@ -460,15 +459,14 @@ def test_the_bias_is_that_of_the_base_and_only_where_it_can_be_right():
     own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14, "spot_um": 0.2}
     # A logistic of steepness 1.6 is a tanh of 0.8; the fab has no gain.
     true = {"alpha": 0.8, "gain": 1.0, **own}
-    result = CloseLoop.model_construct(
-        base_model="physics",
+    answer = Answer(
         base_values={name: 1.3 * own for name, own in true.items()},
         corrected_values={name: 0.9 * own for name, own in true.items()},
     )
     # float32 of the model's values.
-    assert bias_of(draw, result) == pytest.approx((0.3, 0.1), rel=1e-5)
-    assert bias_of(draw.model_copy(update={"base": cause("hill-response")}), result) is None
-    assert bias_of(draw, result.model_copy(update={"base_model": "affine-mtf"})) is None
+    assert bias_of(draw, answer) == pytest.approx((0.3, 0.1), rel=1e-5)
+    assert bias_of(draw.model_copy(update={"base": cause("hill-response")}), answer) is None
+    assert bias_of(draw, Answer()) is None
 
 
 # Scoreboard
@@ -592,7 +590,7 @@ def earlier_row(seed: int, rows: pd.DataFrame) -> str:
 
 def small_board(**changes: object) -> Draws:
     settings = {"board": "singles", "seed": 0, "n_scans": 12, "size_px": 64, "base": "physics"}
-    return campaign.make_draws(**(settings | changes))
+    return make_draws(**(settings | changes))
 
 
 def test_a_campaign_records_a_dying_trial_and_does_not_repeat_a_finished_one(tmp_path, monkeypatch, capsys):
@@ -609,7 +607,7 @@ def test_a_campaign_records_a_dying_trial_and_does_not_repeat_a_finished_one(tmp
         if number == 2:
             raise subprocess.TimeoutExpired(command, 7)
         draw = draws.trials[number]
-        finished_trial(draw, *["missed"] * max(1, len(draw.causes))).write(trial_folder(tmp_path, number))
+        finished_trial(draw, *["missed"] * max(1, len(draw.causes))).write(trial_folder(tmp_path, draw))
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(campaign.subprocess, "run", process)
@@ -649,7 +647,7 @@ def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
     # 8 px cannot be printed.
     draw = drawn(cause("vignetting"))
     trial = run_trial(draw, small_board().model_copy(update={"size_px": 8}), tmp_path)
-    assert trial == Trial.read(trial_folder(tmp_path, 0))
+    assert trial == Trial.read(trial_folder(tmp_path, draw))
     assert "at least 32" in trial.failure
     assert [(one.name, one.verdict) for one in trial.outcomes] == [("vignetting", "failed")]
     assert "Traceback" in capfd.readouterr().err

@@ -26,6 +26,7 @@ from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
 from litho_design.workflows.compare import compare
+from litho_models.boards.board import make_draws
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop.bases import choose_base
@@ -168,8 +169,8 @@ def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str,
             (a.vector == b.vector).all() for a, b in zip(own.per_fold, other[name].per_fold, strict=True)
         )
         assert (own.freed_nm2 == other[name].freed_nm2).all()
-    closed = SimpleNamespace(original=here.scans, study=here)
-    maps = [HeldOut(closed, study).maps_um(state) for study in studies]
+    found = [SimpleNamespace(original=here.scans, study=study) for study in studies]
+    maps = [HeldOut(one).maps_um(state) for one in found]
     assert all((own == its).all() for own, its in zip(*maps, strict=True))
     bases = [
         choose_base("features", scans, replace(study, scans=()), steps=None, cache=tmp_path / name).model
@@ -204,7 +205,7 @@ def test_designs_are_the_same_to_the_bit(
 @pytest.mark.long
 def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
     # Smaller fields cannot be registered.
-    draws = campaign.make_draws(board="singles", seed=0, n_scans=12, size_px=128, base="physics")
+    draws = make_draws(board="singles", seed=0, n_scans=12, size_px=128, base="physics")
     records = []
     for name, dask in (("a", None), ("b", address)):
         (tmp_path / name).mkdir()
@@ -219,7 +220,7 @@ def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> N
 
 
 def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
-    draws = campaign.make_draws(board="singles", seed=0, n_scans=12, size_px=64, base="physics")
+    draws = make_draws(board="singles", seed=0, n_scans=12, size_px=64, base="physics")
     campaign.open_campaign(tmp_path, draws)
     # Long enough for a process to start, too short for a trial.
     settings = {"workers": Workers(dask=address), "timeout_s": 0.3}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.blind_trials.planting import plain_model
 from litho_data.virtual_fab import Fab, Microscope, Noise, Printer, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
+from litho_models.boards.planting import plain_model
 
 
 @pytest.fixture(scope="module")

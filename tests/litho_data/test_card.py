@@ -70,6 +70,12 @@ def test_defaults_are_those_of_the_contract() -> None:
         ("process.registration", "rigid", r"process\.registration.*affine"),
         ("source", {"url": "file:///x", "registry": "a"}, r"source\.url"),
         ("name", "../x", r"name"),
+        ("name", "x" * 201, r"name"),
+        ("scan.files", "a\0{id}", r"scan\.files.*can be read"),
+        ("scan.unit", "m" * 5000, r"scan\.unit = 'm{79}…: "),
+        ("grating", {"period_um": 2.0, "uncertainty_um": 1e308}, r"grating\.uncertainty_um"),
+        ("grating", {"period_um": 2.0, "uncertainty_um": True}, r"grating\.uncertainty_um"),
+        ("grating", {"period_um": 2.0, "uncertainty_um": float("nan")}, r"grating\.uncertainty_um"),
         *(
             (key, before + path + after, rf"{key.replace('.', '[.]')}.*inside the data folder")
             for key, after in (

@@ -67,6 +67,20 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
     assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
 
 
+def test_what_a_step_warns_of_is_said_on_stderr(app, tmp_path: Path) -> None:
+    """A block over half of the lines that it crosses moves them."""
+    height = 0.003 * np.random.default_rng(0).standard_normal((128, 128))
+    height[30:90, 20:90] += 0.8
+    np.savetxt(tmp_path / "scan.txt", height * 1e-6)
+    (tmp_path / "recipe.toml").write_text('[[step]]\nop = "align-rows"\nmethod = "median"\n')
+    words = ["level", tmp_path / "scan.txt", "--unit", "m", "--size-um", 12.8, 12.8]
+    words += ["--recipe", tmp_path / "recipe.toml", "--out", tmp_path / "levelled.npy"]
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    assert done.stderr.startswith("warning: ")
+    assert "warning" not in done.stdout
+
+
 def test_a_scan_is_levelled_in_memory_by_a_recipe_or_its_file(scan_file: Path) -> None:
     scan = read_scan(scan_file, unit="m", size_um=SIZE_UM)
     recipe = scan_file.with_name("recipe.toml")

@@ -324,6 +324,21 @@ def test_toy_reaches_the_true_optimum():
         assert float(efficiency[index]) == pytest.approx(1 - losses[-1], abs=1e-5)
 
 
+def test_a_polish_goes_on_while_a_round_helps():
+    """The first cell gains only once the second has changed, which is tried after it."""
+
+    def objective(level):
+        first, second = level[0, 0, 0, ::2]
+        return torch.where(second == 1, -1 - 3 * first, first + second), {}
+
+    cells = CellMap(LayoutSettings(size_px=4, pitch_um=0.3, cell_um=0.6, levels=3))
+    start = torch.zeros(2, 2, dtype=torch.int64)
+    polished, losses = polish_levels(start, cells, objective, level_count=3, rounds=9)
+    assert polished.tolist() == [[2, 1], [0, 0]]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] == -7
+
+
 def test_polish_of_many_cells_never_raises_the_loss(small_settings, make_printer, target):
     task = HologramTask(small_settings, make_printer(small_settings.layout), inputs={"target": target.pixels})
     cells = CellMap(small_settings.layout)

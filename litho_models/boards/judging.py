@@ -1,4 +1,4 @@
-"""The judge: what the loop says against what was planted, and the error that the true models make.
+"""The judge: what a loop says against what was planted, and the error that the true models make.
 
 The rules are written down in docs/blind_trials.md, before a board is run.
 """
@@ -9,14 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.blind_trials.planting import fab_of, plain_model, printer_of, share_of
-from benchmarks.blind_trials.records import Draw, Found, Outcome, Planted, Verdict
 from litho_data.register.resample import resample_to_layout
-from litho_data.store import PrintedScan
+from litho_data.store import PrintedScan, Store
 from litho_data.virtual_fab import Job, Noise, scan_job
+from litho_models.boards.planting import fab_of, plain_model, printer_of, share_of
+from litho_models.boards.records import Answer, Draw, Found, Outcome, Planted, Trial, TrialErrors, Verdict
 from litho_models.effects import CATALOGUE
 from litho_models.loop.errors import error_rows
-from litho_models.loop.record import CloseLoop
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
@@ -27,27 +26,43 @@ _DISPLACED = "s-shaped-axis"
 _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
-def found_by(result: CloseLoop) -> list[Found]:
-    """What the loop reports: causes, laws and descriptions, and what it sees in single scans."""
-    added = [
-        Found(names=[one.name, *one.confusable_with], knowledge=one.knowledge, by=one.by)
-        for one in result.effects
-    ]
-    seen = [one for one in result.single_scans if one.seen]
-    return added + [
-        Found(names=[one.name, *one.confusable_with], knowledge="cause", by="scan") for one in seen
-    ]
-
-
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
     """Without what the fab's default noise has in every scan: datum, bow, offsets of lines, their like."""
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
 
+def judged(
+    draw: Draw, planted: Sequence[Planted], answer: Answer, jobs: Sequence[Job], store: Store, used_s: float
+) -> Trial:
+    """The trial as it came out.
+
+    Args:
+        draw: of the trial; ``planted``: what was planted, as `plant` returns it.
+        answer: of the loop; ``used_s``: processor seconds that it took.
+        jobs: the fields that were printed; ``store``: what the loop was given.
+    """
+    locked = set(store.locked_ids)
+    scans = [scan for scan in store.scans() if scan.id not in locked]
+    errors = None
+    if answer.before_nm is not None and answer.after_nm is not None:
+        floor_nm = None if draw.kind == "measured" else true_floor(draw, planted, jobs, scans)
+        errors = TrialErrors(before_nm=answer.before_nm, after_nm=answer.after_nm, floor_nm=floor_nm)
+    return Trial(
+        draw=draw,
+        planted=list(planted),
+        outcomes=judge(draw, planted, answer, jobs, scans),
+        false_names=false_names(planted, answer),
+        found=answer.found,
+        errors=errors,
+        bias=bias_of(draw, answer),
+        dataset_cpu_s=used_s,
+    )
+
+
 def judge(
     draw: Draw,
     planted: Sequence[Planted],
-    result: CloseLoop,
+    answer: Answer,
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
@@ -55,9 +70,8 @@ def judge(
 
     What the loop reports counts for one cause at most, for the larger one first.
     """
-    found = found_by(result)
-    rest = result.verdict == "unexplained" or any(one.matters for one in result.explained[-1:])
-    left = rest or bool(_beyond_noise(found))
+    found = answer.found
+    left = answer.left or bool(_beyond_noise(found))
     if not draw.causes:
         return [Outcome(name="none", verdict="false-positive" if left else "clean")]
     verdicts: dict[str, Verdict] = {}
@@ -65,16 +79,18 @@ def judge(
     pool = [one for one in found if one.knowledge == "cause"]
     for one in causes:
         name = one.draw.name
-        hit = next((named for named in pool if _is_right(one, named, result)), None)
+        hit = next((named for named in pool if _is_right(one, named)), None)
         if hit:
             pool.remove(hit)
             verdicts[name] = "right" if {*hit.names} <= {*one.names} else "set-contains-it"
-        elif name == _DISPLACED and _displacement_is_shared(one, result, jobs, scans):
+        elif name == _DISPLACED and _displacement_is_shared(one, answer, jobs, scans):
             verdicts[name] = "right"
     laws = sum(one.knowledge == "law" for one in found)
     for one in causes:
         if one.draw.name not in verdicts:
-            absorbed = draw.kind == "alias" and not one.counts and _is_absorbed(one, result)
+            absorbed = (
+                draw.kind == "alias" and not one.counts and any(own in one.names for own in answer.absorbed)
+            )
             lines = one.draw.name == _OF_LINES and any(_LINES in other.names for other in found)
             silent: Verdict = "absorbed" if absorbed else "noticed" if left or lines else "missed"
             verdicts[one.draw.name] = "lawful" if laws > 0 else silent
@@ -82,12 +98,12 @@ def judge(
     return [Outcome(name=one.name, verdict=verdicts[one.name]) for one in draw.causes]
 
 
-def false_names(planted: Sequence[Planted], result: CloseLoop) -> list[str]:
+def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
     """Sets of causes that the loop named and that have nothing of what was planted, base included."""
     return [
         " | ".join(named.names)
-        for named in _beyond_noise(found_by(result))
-        if named.knowledge == "cause" and not any(_is_right(one, named, result) for one in planted)
+        for named in _beyond_noise(answer.found)
+        if named.knowledge == "cause" and not any(_is_right(one, named) for one in planted)
     ]
 
 
@@ -96,35 +112,25 @@ def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
     return [one for one in planted if one.draw in draw.causes]
 
 
-def _is_right(one: Planted, named: Found, result: CloseLoop) -> bool:
+def _is_right(one: Planted, named: Found) -> bool:
     if not {*one.names} & {*named.names}:
         return False
     wanted = _EXPONENT.get(one.draw.name)
-    return wanted is None or any(
-        own.ci95 is not None and own.ci95[0] <= wanted <= own.ci95[1]
-        for effect in result.effects
-        if effect.name == named.names[0]
-        for own in effect.strengths.get("exponent", [])
-    )
+    return wanted is None or any(low <= wanted <= high for low, high in named.exponents)
 
 
 def _displacement_is_shared(
-    one: Planted, result: CloseLoop, jobs: Sequence[Job], scans: Sequence[PrintedScan]
+    one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Whether the measurement has a displacement along x by a grouping that parts the scans as planted."""
+    """Whether scans share a displacement along x by a grouping that parts them as planted."""
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
-    for part in result.measurement.parts:
-        if part.what == "shift-x":
-            labels: dict[str, set[bool]] = {}
-            for scan in scans:
-                labels.setdefault(label_of(scan, part.by), set()).add(strong[scan.id])
-            if all(len(kinds) == 1 for kinds in labels.values()):
-                return True
+    for grouping in answer.displaced_by:
+        labels: dict[str, set[bool]] = {}
+        for scan in scans:
+            labels.setdefault(label_of(scan, grouping), set()).add(strong[scan.id])
+        if all(len(kinds) == 1 for kinds in labels.values()):
+            return True
     return False
-
-
-def _is_absorbed(one: Planted, result: CloseLoop) -> bool:
-    return any(own.name in one.names and own.verdict == "absorbed" for own in result.candidates)
 
 
 # What no model of all scans can predict: values drawn anew in every scan (or line), rounding, and scars where
@@ -143,7 +149,7 @@ _UNFORESEEABLE = {
 
 
 def true_floor(
-    draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int
+    draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
     """Mean absolute error of the noise-free scans with every cause in place, k = 1, nm.
 
@@ -171,12 +177,12 @@ def true_floor(
     return next(row.mae_nm for row in rows if row.policy == "offset")
 
 
-def bias_of(draw: Draw, result: CloseLoop) -> tuple[float, float] | None:
+def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     """Median of the relative errors of the base's values, as fitted alone and with all that was found.
 
     None if printer or base is no Physics model.
     """
-    if draw.base or draw.kind == "measured" or result.base_model != "physics":
+    if draw.base or draw.kind == "measured" or not answer.base_values:
         return None
     model = plain_model(printer_of(draw))
     assert isinstance(model, Physics)
@@ -188,4 +194,15 @@ def bias_of(draw: Draw, result: CloseLoop) -> tuple[float, float] | None:
     def error(values: dict[str, float]) -> float:
         return float(np.median([abs(values[name] / own - 1) for name, own in true.items() if name in values]))
 
-    return error(result.base_values), error(result.corrected_values)
+    return error(answer.base_values), error(answer.corrected_values)
+
+
+def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
+    """The result of a trial that did not come to an end."""
+    names = [one.name for one in draw.causes] or ["none"]
+    return Trial(
+        draw=draw,
+        planted=planted or [],
+        outcomes=[Outcome(name=name, verdict="failed") for name in names],
+        failure=" ".join(reason.split()),
+    )

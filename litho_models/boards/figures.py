@@ -1,21 +1,17 @@
-"""The scoreboard: all draws with their outcomes, the few figures that count, and their text for the page."""
+"""The scoreboard: all draws with their outcomes, and the few figures that count."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from benchmarks.blind_trials.other_forms import FORMS
-from benchmarks.blind_trials.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
-from benchmarks.markdown_table import markdown_table
-from benchmarks.record import publish
-from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
+from litho_models.boards.other_forms import FORMS
+from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
 
 # Largest error after that is accepted, as a multiple of that of the true models.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
@@ -106,6 +102,14 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         spent = f"{np.mean(minutes):.1f}, {max(minutes):.1f}"
         figures.append(Figure("processor minutes of a data set: mean, longest", spent))
     return figures
+
+
+def figure_lines(scoreboard: Scoreboard) -> list[str]:
+    """The figures that count as lines of a terminal."""
+    return [
+        f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else "")
+        for what, value, wanted in figures_of(scoreboard)
+    ]
 
 
 def reaches_floor(trial: Trial) -> bool:
@@ -201,25 +205,3 @@ def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
             kind = {"trial": trial.draw.number, "kind": trial.draw.kind}
             rows.append(kind | planted | outcome.model_dump() | shared)
     return pd.DataFrame(rows)
-
-
-def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
-    """Put the figures into the page, in place of what stood between the marks of the board.
-
-    Raises:
-        InputError: trials that have not been run, or a page without the marks.
-    """
-    if scoreboard.pending:
-        raise InputError("scoreboard to publish", got=f"pending trials {scoreboard.pending}", wanted="none")
-    publish(page, mark_of(scoreboard), as_markdown(scoreboard))
-
-
-def mark_of(scoreboard: Scoreboard) -> str:
-    """What the marks of a board in the page are called."""
-    return f"board of {scoreboard.board} {scoreboard.seed}"
-
-
-def as_markdown(scoreboard: Scoreboard) -> str:
-    """Command and figures."""
-    rows = [tuple(figure) for figure in figures_of(scoreboard)]
-    return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'wanted'), rows)}"

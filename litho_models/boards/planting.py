@@ -13,9 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.blind_trials.draws import names_of
-from benchmarks.blind_trials.other_forms import FORMS, FormCause
-from benchmarks.blind_trials.records import CauseDraw, Draw, Planted
 from litho_data.layouts.card_text import write_card, write_layout
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.store import PrintedScan
@@ -23,6 +20,9 @@ from litho_data.virtual_fab import KNOBS, Fab, Job, KnobSetting, Microscope, Noi
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.strength import knob_rms_nm, search_strength
+from litho_models.boards.draws import names_of
+from litho_models.boards.other_forms import FORMS, FormCause
+from litho_models.boards.records import CauseDraw, Draw, Planted
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
 from litho_models.fitting.small_models import ModelProblem
 from litho_models.models import build_model

@@ -1,4 +1,4 @@
-"""The files of a board: `draws.json` before it, `trial.json` per trial, `scoreboard.json` after it."""
+"""The files of a board: draws, what they hide, the answer of a loop, each trial as judged, the scoreboard."""
 
 from __future__ import annotations
 
@@ -91,6 +91,15 @@ class Planted(Record):
         return self.rms_nm > COUNTS_FROM_RMS_NM
 
 
+class Hidden(Result):
+    """What one store of a board hides; a loop does not see it."""
+
+    SCHEMA: ClassVar[str] = "litho-models/board-hidden/1"
+    FILE_NAME: ClassVar[str] = "hidden.json"
+
+    planted: list[Planted]
+
+
 class Outcome(Record):
     """What became of one planted cause, or of the whole trial where nothing was planted."""
 
@@ -115,11 +124,44 @@ class TrialErrors(Record):
 
 
 class Found(Record):
-    """One thing that the loop reports: ``names`` has its own and those that look the same."""
+    """One thing that a loop reports.
+
+    Attributes:
+        names: of the catalogue, its own first, then those that look the same.
+        by: ``all``; ``scan`` where every scan has its own; or what its strength differs by.
+        exponents: intervals of its exponent, where it is a power law.
+    """
 
     names: list[str]
     knowledge: Literal["cause", "law", "description"]
-    by: str
+    by: str = "all"
+    exponents: list[tuple[float, float]] = Field(default_factory=list)
+
+
+class Answer(Result):
+    """What a loop says of one store.
+
+    Attributes:
+        found: causes, laws and descriptions.
+        left: whether something is left that it cannot explain.
+        absorbed: names of effects that its base takes up.
+        displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
+        before_nm, after_nm: mean absolute error on scans that the fit has not seen, one offset per scan free:
+            without and with what was found; over the scans that are not locked. None: not stated.
+        base_values, corrected_values: the Physics model's, without and with what was found.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/board-answer/1"
+    FILE_NAME: ClassVar[str] = "answer.json"
+
+    found: list[Found] = Field(default_factory=list)
+    left: bool = False
+    absorbed: list[str] = Field(default_factory=list)
+    displaced_by: list[str] = Field(default_factory=list)
+    before_nm: float | None = None
+    after_nm: float | None = None
+    base_values: dict[str, float] = Field(default_factory=dict)
+    corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
 class Trial(Result):

@@ -11,10 +11,10 @@ from itertools import chain, islice
 
 import numpy as np
 
-from benchmarks.blind_trials.other_forms import FORMS
-from benchmarks.blind_trials.records import Board, CauseDraw, Draw, Kind
 from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS, OFF_CATALOGUE
+from litho_models.boards.other_forms import FORMS
+from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
 # Sought on four scans, a size is up to 13 % off on all of them: what is drawn is to count nevertheless.

@@ -1,0 +1,33 @@
+"""A scoreboard in the page of the documentation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import publish
+from litho_data.foundation.errors import InputError
+from litho_models.boards.figures import figures_of
+from litho_models.boards.records import Scoreboard
+
+
+def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
+    """Put the figures into the page, in place of what stood between the marks of the board.
+
+    Raises:
+        InputError: trials that have not been run, or a page without the marks.
+    """
+    if scoreboard.pending:
+        raise InputError("scoreboard to publish", got=f"pending trials {scoreboard.pending}", wanted="none")
+    publish(page, mark_of(scoreboard), as_markdown(scoreboard))
+
+
+def mark_of(scoreboard: Scoreboard) -> str:
+    """What the marks of a board in the page are called."""
+    return f"board of {scoreboard.board} {scoreboard.seed}"
+
+
+def as_markdown(scoreboard: Scoreboard) -> str:
+    """Command and figures."""
+    rows = [tuple(figure) for figure in figures_of(scoreboard)]
+    return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'wanted'), rows)}"

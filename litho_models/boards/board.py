@@ -1,0 +1,206 @@
+"""A board anyone's loop can enter: stores that hide causes, what was hidden beside them, and the judge."""
+
+from __future__ import annotations
+
+import resource
+import shlex
+import shutil
+import subprocess
+import tempfile
+import traceback
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+from litho_data.commands.progress import command_line, progress
+from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.results import Result
+from litho_data.making.build import build_dataset
+from litho_data.store import open_store
+from litho_data.virtual_fab.jobs import Plan
+from litho_models.boards.draws import draw_board
+from litho_models.boards.figures import make_scoreboard, trial_table
+from litho_models.boards.judging import failed, judged
+from litho_models.boards.own_loop import own_loop
+from litho_models.boards.planting import plant, trial_jobs, write_raw
+from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
+
+# The printers of single causes are Physics models; mixtures have others too, so there the bases compete.
+BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
+STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
+# A dataset store and an empty folder to work in, to what the loop says.
+Loop = Callable[[Path, Path], Answer]
+
+
+class Judged(Result):
+    """Which board and loop a folder of judged trials belongs to."""
+
+    SCHEMA: ClassVar[str] = "litho-models/board-judged/1"
+    FILE_NAME: ClassVar[str] = "judged.json"
+
+    draws_sha256: str
+    loop: str
+
+
+def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
+    """The draws of a board.
+
+    Raises:
+        InputError: settings that cannot be drawn, or fields that cannot be printed.
+    """
+    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
+    trials = draw_board(board, seed)
+    return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
+
+
+def new_board(
+    out: str | Path,
+    *,
+    board: Board = "singles",
+    seed: int = 0,
+    trials: int | None = None,
+    n_scans: int = 12,
+    size_px: int = 256,
+) -> Draws:
+    """Make the stores of a board in ``out/stores`` and write what they hide to ``out/hidden``; resumable.
+
+    Args:
+        out: folder of the board.
+        board: one cause a trial, or two to four; ``seed``: decides everything.
+        trials: only so many of those that are drawn, which are in random order.
+        n_scans: of each store; ``size_px``: side of a layout.
+
+    Raises:
+        InputError: settings that cannot be drawn, or a folder with another board.
+    """
+    drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
+    # Causes in measured prints need a store of those.
+    kept = [draw for draw in drawn.trials if draw.kind != "measured"][:trials]
+    draws = drawn.model_copy(update={"trials": kept})
+    facts = draws.model_dump(mode="json", exclude={"schema_"})
+    with growing_folder(out, Draws.FILE_NAME, facts) as begun:
+        for draw in progress(kept, "printing and scanning"):
+            hidden, store = begun.folder / HIDDEN / name_of(draw), store_of(begun.folder, draw)
+            if not (hidden / Hidden.FILE_NAME).exists():
+                jobs = trial_jobs(draw, n_scans, size_px)
+                planted = plant(draw, jobs)
+                store.parent.mkdir(exist_ok=True)
+                with tempfile.TemporaryDirectory() as place:
+                    made = Path(place) / store.name
+                    build_dataset(write_raw(draw, planted, jobs, Path(place) / "raw"), made)
+                    shutil.rmtree(store, ignore_errors=True)
+                    shutil.move(made, store)
+                Hidden(planted=planted).write(hidden)
+        draws.write(begun.folder)
+    return draws
+
+
+def judge_board(
+    board: str | Path,
+    out: str | Path,
+    loop: Loop | None = None,
+    *,
+    name: str | None = None,
+    report: Callable[[str], None] = lambda message: None,
+) -> Scoreboard:
+    """Give a loop every store of a board, judge what it says, and write ``scoreboard.json`` and its table.
+
+    An error inside the loop is the result of that trial. An interrupted run resumes.
+
+    Args:
+        board: folder of ``new_board``.
+        out: folder of the trials, each with what the loop wrote there.
+        loop: given a store and an empty folder; by default the closed loop of this package.
+        name: what the loop is called; a folder of another one is refused.
+        report: told what the default loop does, a sentence at a time.
+
+    Raises:
+        InputError: no board, or a folder with the trials of another board or loop.
+    """
+    source = Path(board)
+    draws = Draws.read(source)
+    asked = loop or partial(own_loop, base=draws.base, report=report)
+    judged_as = Judged(
+        draws_sha256=file_sha256(source / Draws.FILE_NAME),
+        loop=name or (getattr(loop, "__name__", "a loop") if loop else "litho-models close-loop"),
+    )
+    facts = judged_as.model_dump(mode="json", exclude={"schema_"})
+    with growing_folder(out, Judged.FILE_NAME, facts) as begun:
+        for draw in progress(draws.trials, "judging"):
+            folder = begun.folder / TRIALS / name_of(draw)
+            if not (folder / Trial.FILE_NAME).exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir(parents=True)
+                trial = _trial(draw, draws, source, folder, asked)
+                trial.write(folder)
+                report(trial_line(trial))
+        done = [Trial.read(begun.folder / TRIALS / name_of(draw)) for draw in draws.trials]
+        scoreboard = make_scoreboard(draws, done, command_line())
+        scoreboard.write(begun.folder)
+        trial_table(scoreboard).to_csv(begun.folder / "scoreboard.csv", index=False)
+        judged_as.write(begun.folder)
+    return scoreboard
+
+
+def command_loop(command: str) -> Loop:
+    """A loop that is a command: it is given STORE and FOLDER as its last words and writes FOLDER/answer.json.
+
+    Raises:
+        InputError: from the loop, a command that cannot be run, ends with another code than 0, or writes no
+            answer.
+    """
+    words = shlex.split(command)
+    if not words or not shutil.which(words[0]):
+        raise InputError("command of the loop", got=command or "nothing", wanted="a program and its words")
+
+    def loop(store: Path, folder: Path) -> Answer:
+        code = subprocess.run([*words, str(store), str(folder)], check=False).returncode
+        if code:
+            raise InputError(command, got=f"exit code {code}", wanted="0")
+        return Answer.read(folder / Answer.FILE_NAME)
+
+    return loop
+
+
+def _trial(draw: Draw, draws: Draws, board: Path, folder: Path, loop: Loop) -> Trial:
+    planted = Hidden.read(board / HIDDEN / name_of(draw)).planted
+    store, started_s = store_of(board, draw), cpu_s()
+    try:
+        answer = loop(store, folder)
+        used_s = cpu_s() - started_s
+        jobs = trial_jobs(draw, draws.n_scans, draws.size_px)
+        return judged(draw, planted, answer, jobs, open_store(store), used_s)
+    except Exception as error:
+        traceback.print_exc()
+        # Results are published: where they were made must not show.
+        reason = f"{type(error).__name__}: {error}".replace(str(folder), "OUT").replace(str(board), "BOARD")
+        return failed(draw, reason, planted)
+
+
+def name_of(draw: Draw) -> str:
+    """Two digits, as files and folders of a trial are called."""
+    return f"{draw.number:02d}"
+
+
+def store_of(board: Path, draw: Draw) -> Path:
+    """The store that a loop is given."""
+    return board / STORES / f"{name_of(draw)}.zarr"
+
+
+def cpu_s() -> float:
+    """Processor seconds of this process and of those that it has waited for."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def trial_line(trial: Trial) -> str:
+    """A trial in a line: what became of each cause, false names, error, reason of a failure."""
+    causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
+    false = [f"false: {name}" for name in trial.false_names]
+    ratio = trial.errors and trial.errors.ratio
+    errors = [f"{ratio:.2f} × the true models"] if ratio else []
+    reason = [trial.failure] if trial.failure else []
+    return f"trial {trial.draw.number}: {', '.join([*causes, *false, *errors, *reason])}"

@@ -1,0 +1,67 @@
+"""`litho-models board new` and `judge`: stores that hide causes, and what a loop makes of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+board = typer.Typer(help="Blind boards: can a loop name what the virtual fab hides?", no_args_is_help=True)
+
+
+@board.command("new")
+def new(
+    out: Annotated[Path, typer.Option("--out", help="folder of the board")],
+    kind: Annotated[
+        Literal["singles", "mixtures"], typer.Option("--kind", help="one cause a store, or two to four")
+    ] = "singles",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="decides what is hidden")] = 0,
+    trials: Annotated[
+        int | None, typer.Option("--trials", min=1, help="stores; all that are drawn by default, some 40")
+    ] = None,
+    scans: Annotated[int, typer.Option("--scans", min=2, help="of each store")] = 12,
+    size_px: Annotated[int, typer.Option("--size-px", help="side of a layout, pixels of 0.1 µm")] = 256,
+) -> None:
+    """Print and scan in the virtual fab with hidden causes: stores for a loop, the truth for the judge.
+
+    Example: litho-models board new --trials 8 --out board
+    """
+    from litho_models.boards.board import HIDDEN, STORES, new_board
+
+    draws = new_board(out, board=kind, seed=seed, trials=trials, n_scans=scans, size_px=size_px)
+    typer.echo(
+        f"{len(draws.trials)} stores for the loop: {out / STORES}; for the judge alone: {out / HIDDEN}"
+    )
+
+
+@board.command("judge")
+def judge(
+    folder: Annotated[Path, typer.Argument(help="folder of `board new`", metavar="BOARD")],
+    out: Annotated[Path, typer.Option("--out", help="folder of the trials, figures and table")],
+    loop: Annotated[
+        str | None,
+        typer.Option(
+            "--loop",
+            help="command of the loop: it gets STORE and FOLDER as last words and writes FOLDER/answer.json; "
+            "by default close-loop of this package",
+        ),
+    ] = None,
+) -> None:
+    """Give every store of a board to a loop and judge the causes that it names; resumable.
+
+    Example: litho-models board judge board --loop "python my_loop.py" --out judged
+    """
+    from litho_models.boards.board import command_loop, judge_board
+    from litho_models.boards.figures import figure_lines
+
+    scoreboard = judge_board(
+        folder,
+        out,
+        command_loop(loop) if loop else None,
+        name=loop,
+        report=lambda message: typer.echo(message, err=True),
+    )
+    for line in figure_lines(scoreboard):
+        typer.echo(line)
+    typer.echo(f"all trials: {out / 'scoreboard.csv'}")
