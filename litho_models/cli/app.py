@@ -40,13 +40,11 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
     option("terms fitted to each scan for its datum-free error; offset by default, for films none"),
 ]
-_BACKGROUND_HELP = (
-    "training: add the smooth background that the training scans share to predictions of measured maps"
-)
+_BACKGROUND_HELP = "training: add the smooth background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
+    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -65,7 +63,7 @@ PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
     option("of the products within networks in training; the recipe's by default", hidden=True),
 ]
-Seed = Annotated[int, option("seed of weights, crops and splits", min=0)]
+Seed = Annotated[int, option("of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
@@ -174,7 +172,7 @@ def benchmark(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
-    folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
+    folds: Annotated[int, option("of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
         option("only so many of the folds, to compare seeds; all by default", min=1, hidden=True),
@@ -183,7 +181,7 @@ def benchmark(
     background: SharedOption = None,
     noise: NoiseOption = None,
     open_lock_box: Annotated[
-        bool, option("also score the locked scans; once per release", "--open-lock-box")
+        bool, option("also score the locked scans; do this once", "--open-lock-box")
     ] = False,
     seed: Seed = 0,
     training_seed: Annotated[

@@ -91,9 +91,9 @@ class HeldOut:
 
     @property
     def stages(self) -> dict[Stage, State]:
-        """The same, and the model between them if there are causes and laws."""
-        causes: dict[Stage, State] = {"causes": self.closed.chosen.named.state}
-        between = causes if self.closed.causes and self.closed.chosen.lawful.causes else {}
+        """The same, and the model with the causes alone between them if it is neither."""
+        causes = self.closed.chosen.named.state
+        between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
         return {"base": self.closed.base, **between, **self.ends}
 
     def errors(self) -> list[ErrorRow]:
