@@ -20,9 +20,9 @@ CARD = PAGE.parents[1] / "datasets" / "neural-lithography.toml"
 THEIR_FILES = """cuda_config data/__init__ data/afm_dataio litho/learned_litho litho/net/__init__
     litho/net/fno litho/net/simple_conv main_fwd_litho_training main_inv_holo_optim main_inv_lens_optim
     param/__init__ param/param_fwd_litho param/param_inv_design_holography param/param_inv_design_imaging
-    task/doe task/free_space_fwd task/propagator task/reconstruction trainer/__init__ trainer/fwd_learned_litho_trainer
-    trainer/mbo_holo trainer/mbo_lens utils/__init__ utils/general_utils utils/gumbel_max_pytorch
-    utils/visualize_utils"""
+    task/doe task/free_space_fwd task/propagator task/reconstruction trainer/__init__
+    trainer/fwd_learned_litho_trainer trainer/mbo_holo trainer/mbo_lens utils/__init__
+    utils/general_utils utils/gumbel_max_pytorch utils/visualize_utils"""
 
 
 def test_every_equation_figure_and_table_has_a_row() -> None:
