@@ -27,6 +27,8 @@ from litho_design.workflows.first import small_hologram
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
 # The two bands of the measured prints, cycles per µm, in turn.
 _CUTOFFS_PER_UM = (0.25, 0.5)
+# The stair takes three fifths of a side, and the printer rounds its edges: few wide steps.
+_TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -133,7 +135,7 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
     return {
         "substrate": flat(shape, level=0),
         "flat": flat(shape, level=highest // 2),
-        "steps": framed_ladder(random(count), highest=highest),
+        "steps": framed_ladder(random(count), highest=highest, tread_px=geometry.size_px // _TREADS),
         **{f"L{number + 1:0{digits}}": random(number) for number in range(count)},
     }
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from litho_data import build_dataset
 from litho_data.cards.card import load_card
+from litho_data.commands.progress import say
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
@@ -45,7 +46,7 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
         build_dataset(source / CARD_NAME, store)
         model = given.settings["model"]
         evaluated = evaluate(model, store, folder / "evaluation")
-        loop = close_loop(store, folder / "loop", base=_BASE)
+        loop = close_loop(store, folder / "loop", base=_BASE, report=say)
         freeze(folder / "loop", folder / "printer")
         base, corrected = loop.error("base"), loop.error("all")
         assert base is not None
