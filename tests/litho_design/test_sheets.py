@@ -89,7 +89,7 @@ def test_what_comes_back_is_a_model_a_loop_and_a_comparison(sheet, tmp_path, mon
     # Witnesses are not learned from.
     assert len(open_store(tmp_path / "answer" / "prints.zarr").scans()) == 7
     printer = load_frozen(tmp_path / "answer" / "printer")
-    assert printer.card.levels == 13
+    assert printer.card["levels"] == 13
     # The fab's noise is some nm; the model that designed was learned from another printer.
     assert 1 < result.own_nm < result.model_nm
     assert result.measured_db["with"] == pytest.approx(result.expected_db["with"], abs=6)
