@@ -86,8 +86,10 @@ def test_what_comes_back_is_a_model_a_loop_and_a_comparison(sheet, tmp_path, mon
     assert not (tmp_path / "answer").exists()
     print_and_scan(sheet)
     result = read_sheet(sheet, tmp_path / "answer")
-    # Witnesses are not learned from.
-    assert len(open_store(tmp_path / "answer" / "prints.zarr").scans()) == 7
+    # Witnesses are kept and not learned from, those with nothing on them too.
+    store = open_store(tmp_path / "answer" / "prints.zarr")
+    assert len(store.scans()) == 7
+    assert store.references() == {"flat": "flat", "steps": "steps", "substrate": "substrate"}
     printer = load_frozen(tmp_path / "answer" / "printer")
     assert printer.card["levels"] == 13
     # The fab's noise is some nm; the model that designed was learned from another printer.
