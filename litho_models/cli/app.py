@@ -1,7 +1,5 @@
 """``litho-models``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -101,7 +99,7 @@ def train(
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
-    from litho_models.frozen.readme import bounds_text
+    from litho_models.frozen.card import bounds_text
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
     run = litho_models.train(
@@ -137,7 +135,7 @@ def evaluate(
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
     from litho_models.evaluation.reports import lock_box_text
-    from litho_models.evaluation.tables import evaluation_verdict
+    from litho_models.evaluation.wording import evaluation_verdict
 
     result = litho_models.evaluate(
         model,

@@ -3,8 +3,6 @@
 Each (model, fold) is a folder of its own, named by the hash of everything that decides it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whole fields of any size: tiles that are exact where the model has a receptive radius, else blended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
