@@ -78,15 +78,14 @@ def new_sheet(
             device=device, announce=announce,
         )  # fmt: skip
         fields: list[Field] = []
-        size = {"pitch_um": geometry.pitch_um, "level_height_um": geometry.level_height_um}
         for name, level in levels.items():
             write_layout(folder, name, level)
             what = _WITNESSES.get(name, "a random layout, to learn the printer from")
-            file = "" if name == "substrate" else _exported(level, format, folder, name, **size)
+            file = "" if name == "substrate" else _exported(level, format, folder, name, geometry)
             fields.append(Field(order=len(fields), id=name, file=file, what=what))
         for arm in ARMS:
             design = design_folder(folder / HOLOGRAM, arm, 0)
-            file = _exported(design, format, folder, f"{HOLOGRAM}-{arm}")
+            file = _exported(design, format, folder, f"{HOLOGRAM}-{arm}", geometry)
             fields.append(Field(order=len(fields), id=arm, file=file, what=_HOLOGRAMS[arm]))
         rows = [(one.id, one.order, one.id if one.id in _WITNESSES else "dataset") for one in fields]
         write_table(folder, ("id", "order", "use"), rows[: len(levels)])
@@ -95,10 +94,11 @@ def new_sheet(
             name="printed-sheet",
             title="One sheet, printed and scanned to learn a printer from",
             scan_size_um=(geometry.size_um, geometry.size_um),
+            pitch_um=geometry.pitch_um,
+            level_height_um=geometry.level_height_um,
             levels=geometry.levels,
             ids={"table": TABLE_NAME},
             write={"slow_axis": "y"},
-            **size,
         )
         sheet = Sheet(
             **run_facts(),
@@ -140,6 +140,10 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
     }
 
 
-def _exported(source: np.ndarray | Path, format: Format, folder: Path, name: str, **size: float) -> str:
+def _exported(
+    source: np.ndarray | Path, format: Format, folder: Path, name: str, geometry: LayoutSettings
+) -> str:
     """Write the printer's file of a field; its path within the sheet."""
-    return export(source, format, folder / TO_PRINTER / name, **size).relative_to(folder).as_posix()
+    size = geometry.pitch_um, geometry.level_height_um
+    file = export(source, format, folder / TO_PRINTER / name, pitch_um=size[0], level_height_um=size[1])
+    return file.relative_to(folder).as_posix()
