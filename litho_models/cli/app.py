@@ -21,7 +21,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
 from litho_models.cli.board import board
-from litho_models.cli.loop import check, close_loop, next_print
+from litho_models.cli.loop import FixOption, FreeOption, check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
@@ -40,13 +40,11 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
     option("terms fitted to each scan for its datum-free error; offset by default, for films none"),
 ]
-_BACKGROUND_HELP = (
-    "training: add the smooth background that the training scans share to predictions of measured maps"
-)
+_BACKGROUND_HELP = "training: add the smooth background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
+    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -65,10 +63,13 @@ PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
     option("of the products within networks in training; the recipe's by default", hidden=True),
 ]
-Seed = Annotated[int, option("seed of weights, crops and splits", min=0)]
+Seed = Annotated[int, option("of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
-    option("FIELD=VALUE of the training, such as learning_rate=0.001; repeatable", "--set"),
+    option(
+        "FIELD=VALUE of training or model, such as learning_rate=0.001 or spot.sigma_um=0.3; repeatable",
+        "--set",
+    ),
 ]
 
 
@@ -80,7 +81,7 @@ def train(
         str,
         option(
             "identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
-            "e-beam, pbl or fno"
+            "e-beam, projection, laser-writer, dmd-grayscale, pbl or fno"
         ),
     ],
     out: Out,
@@ -90,6 +91,8 @@ def train(
     precision: PrecisionOption = None,
     seed: Seed = 0,
     set_: SetOption = None,
+    fix: FixOption = None,
+    free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
         option("train on the locked scans too; nothing is left to judge by", "--use-lock-box"),
@@ -100,8 +103,11 @@ def train(
     Example: litho-models train prints.zarr --model pbl --out run
     """
     from litho_models.frozen.card import bounds_text
+    from litho_models.models import fixed_numbers
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
+    if fix or free:
+        settings["fixed"] = fixed_numbers(model, fix or (), free or ())
     run = litho_models.train(
         store, model, out, recipe=settings.pop("recipe"), settings=settings, use_lock_box=use_lock_box
     )
@@ -166,7 +172,7 @@ def benchmark(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
-    folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
+    folds: Annotated[int, option("of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
         option("only so many of the folds, to compare seeds; all by default", min=1, hidden=True),
@@ -175,7 +181,7 @@ def benchmark(
     background: SharedOption = None,
     noise: NoiseOption = None,
     open_lock_box: Annotated[
-        bool, option("also score the locked scans; once per release", "--open-lock-box")
+        bool, option("also score the locked scans; do this once", "--open-lock-box")
     ] = False,
     seed: Seed = 0,
     training_seed: Annotated[

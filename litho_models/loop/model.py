@@ -217,7 +217,9 @@ class Twin:
         facts = [slot.facts for slot in self.slots]
         nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
         known = [
-            (one.lower, one.upper, abs(one.typical - null)) for one, null in zip(facts, nulls, strict=True)
+            # What is zero as a rule, as an angle, has a tenth of its range for a usual size.
+            (one.lower, one.upper, abs(one.typical - null) or 0.1 * (one.upper - one.lower))
+            for one, null in zip(facts, nulls, strict=True)
         ]
         return np.array(known).reshape(-1, 3).T
 

@@ -52,7 +52,8 @@ def record(
     effects = [_found(closed, one, left_out_nm, survives_on) for one in closed.found]
     by_stage = {row.model: row for row in errors if row.is_headline}
     before, after = by_stage["base"], by_stage["all"]
-    gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
+    was_nm, is_nm = before.leading_by_scan_nm, after.leading_by_scan_nm
+    gains = [was_nm[scan.id] - is_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
         **given,
@@ -143,7 +144,7 @@ def _found(
 
 
 def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for; of a table alone."""
+    """Numbers of an effect with intervals from what each print (or scan) asks for."""
     from scipy.stats import t
 
     facts, found = get_effect(cause.name).parameters, dict[str, list[Strength]]()
@@ -153,9 +154,6 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
         own = Strength(label=label, value=value, unit=facts[parameter].unit, ci95=ci95)
         found.setdefault(parameter, []).append(own)
 
-    for label, values in cause.values.items():
-        for parameter, value in values.items():
-            add(parameter, label, value)
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
@@ -208,8 +206,10 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
     """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
     sets = {other: one.name for one in added for other in one.confusable_with}
-    untestable = {**UNTESTABLE, **closed.untestable}
-    names = dict.fromkeys([*untestable, *(one.name for one in CATALOGUE.values() if not one.per_scan)])
+    films = closed.study.of_films
+    untestable = {} if films else {**UNTESTABLE, **closed.untestable}
+    tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
+    names = dict.fromkeys([*untestable, *tried])
     found = []
     for name in names:
         if name not in seen and all(one.name != name for one in added):

@@ -36,7 +36,7 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        values: of its parameters by label, where no model has it.
+        values: of its parameters by label, from which a table is fitted.
     """
 
     name: str
@@ -91,7 +91,7 @@ def search(
 def describe(
     state: State, study: Study, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Tables that stand out beside a model, each as a linear fit beside it alone; they enter no model."""
+    """Tables that stand out beside a model, each as a linear fit beside it alone."""
     screening, found = Screening(state, study, tables, secants), []
     for one in _standing(screening, Found(state))[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
