@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "measured_prints.md"
 FOLDER = ROOT / "docs" / "results" / "neural-lithography" / "causes"
 PICTURE = "errors.png"
-_MODELS = {"base": "the base", "causes": "with the causes", "all": "with causes and laws"}
+_MODELS = {"base": "the base", "causes": "with the causes", "all": "with all that was found"}
 _MEASURED = {
     "print alone": "nothing",
     "published": "the smooth background that all scans share (published protocol)",

@@ -26,7 +26,6 @@ from litho_models.frozen.card import OUT_OF_FOLD, TRAINED_ON, Attribution, CardM
 from litho_models.frozen.files import README_FILE, load_frozen
 from litho_models.frozen.freezing import SCAN_AXIS, freeze
 from litho_models.frozen.on_store import card_background, predict_frozen
-from litho_models.frozen.readme import model_readme
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
@@ -85,7 +84,7 @@ def make_zoo(
         }
         cards[name] = card.model_copy(update=described)
         cards[name].write(folder)
-        (folder / README_FILE).write_text(model_readme(cards[name]), encoding="utf-8")
+        (folder / README_FILE).write_text(cards[name].page, encoding="utf-8")
     size = size_bytes(root)
     if size > LARGEST_ZOO_BYTES:
         raise InputError("size of the zoo", got=f"{size} bytes", wanted=f"at most {LARGEST_ZOO_BYTES}")

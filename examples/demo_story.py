@@ -18,7 +18,7 @@ from litho_design.judging.loaded import LoadedDesign
 from litho_design.reports.parts import BRIGHTEST
 from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
-from litho_models.evaluation.tables import benchmark_verdict
+from litho_models.evaluation.wording import benchmark_verdict
 from litho_models.loop.record import CloseLoop, FoundEffect
 
 if TYPE_CHECKING:

@@ -56,6 +56,7 @@ _VOLATILE = {
     "seconds",
     "seconds_per_iteration",
     "started",
+    "ended",
     "command",
     "commit",
     "dirty",

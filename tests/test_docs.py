@@ -29,6 +29,7 @@ SMALLER = {
         '"layout.size_px": 192, "optics.distance_um": 18, "search.iterations": 30': '"layout.size_px": 64, '
         '"optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0, "window.yield_draws": 4'
     },
+    "gallery": {"count=4": "count=2", '"search.iterations": 20': '"search.iterations": 2'},
 }
 
 
@@ -151,6 +152,19 @@ def test_a_notebook_is_its_tutorial_after_one_cell_that_installs(renderer, name)
     for cell in made["cells"]:
         asked = {"cell_type", "id", "metadata", "source"}
         assert set(cell) == asked | ({"outputs", "execution_count"} if cell["cell_type"] == "code" else set())
+
+
+def test_the_gallery_has_twelve_pictures_of_ten_lines_each(renderer):
+    cells = renderer.cells((DOCS / "tutorials" / "gallery.py").read_text("utf-8"))
+    titles = [text for kind, text in cells if kind == "markdown" and re.match(r"## \d+\. ", text)]
+    assert [int(re.findall(r"\d+", title)[0]) for title in titles] == [*range(1, 13)]
+    lines = [sum(bool(line) for line in text.splitlines()) for kind, text in cells[2:] if kind == "code"]
+    assert len(lines) == 12
+    assert max(lines) <= 10
+    page = (DOCS / "tutorials" / "gallery.md").read_text("utf-8")
+    shown = re.findall(r"\]\((gallery-\d+\.jpg)\)", page)
+    assert shown == [f"gallery-{number}.jpg" for number in range(1, 13)]
+    assert all((DOCS / "tutorials" / name).stat().st_size > 5_000 for name in shown)
 
 
 SHORT = [page for page in PAGES if "**In short" in page.read_text("utf-8")]

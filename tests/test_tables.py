@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from litho_data.foundation.results import Record
+from litho_data.reports.page import Page
 from litho_design.reports.parts import level_table
 from litho_models.evaluation.plots import error_bars
 from litho_models.evaluation.results import Benchmark
@@ -32,6 +34,31 @@ TABLES = {
     "scan,ci95_nm\nP11,1.05 … 2.00\n": "row 0",
     ",scan\n0,P11\n1,P12\n": "without a name",
 }
+
+
+class Row(Record):
+    """A row of a report."""
+
+    scan: str
+    mae_nm: float
+
+
+class LongerRow(Row):
+    """The same with one figure more."""
+
+    tallest_um: float
+
+
+def test_a_further_field_of_a_record_is_a_further_column_of_its_table(tmp_path: Path) -> None:
+    for number, row in enumerate(
+        (Row(scan="P11", mae_nm=1.5), LongerRow(scan="P11", mae_nm=1.5, tallest_um=7.125))
+    ):
+        page = Page("Rows")
+        page.table([row], "All.", f"{number}.csv", digits=3)
+        text = page.write(tmp_path).read_text()
+        assert ("tallest (µm)" in text) == ("7.125" in text) == (number == 1)
+    assert (tmp_path / "0.csv").read_text() == "scan,mae_nm\nP11,1.5\n"
+    assert (tmp_path / "1.csv").read_text() == "scan,mae_nm,tallest_um\nP11,1.5,7.125\n"
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -1,9 +1,11 @@
-"""The three commands say their version, and keep asking for a command without one."""
+"""What every command says: its version, an example, its options in one style, and at its end what to open."""
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
+from pathlib import Path
 
 import pytest
 from typer.main import get_command
@@ -52,3 +54,37 @@ def test_every_option_is_described_in_one_style(package):
             assert not said.endswith("."), f"{name}: {said}"
             assert not re.search(r"\[[a-z]", said), f"{name}: {said}"
             assert "(repeatable)" not in said, f"{name}: {said}"
+
+
+def silent_about_its_result(source: str) -> list[str]:
+    """Functions of a command line that take ``out`` and print neither it nor a file in it."""
+    made = {one.name: one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef)}
+
+    def printed(function: ast.FunctionDef) -> str:
+        calls = [one for one in ast.walk(function) if isinstance(one, ast.Call)]
+        own = [ast.unparse(one) for one in calls if ast.unparse(one.func) in ("print", "typer.echo")]
+        helpers = {ast.unparse(one.func) for one in calls} & {
+            name for name in made if name.startswith("_print")
+        }
+        return " ".join([*own, *(printed(made[name]) for name in helpers)])
+
+    def takes_out(function: ast.FunctionDef) -> bool:
+        return "out" in [one.arg for one in function.args.args + function.args.kwonlyargs]
+
+    commands = [one for name, one in made.items() if takes_out(one) and not name.startswith("_")]
+    return [one.name for one in commands if not re.search(r"\b(out|file|card|target)\b", printed(one))]
+
+
+def test_every_command_that_writes_says_what_to_open():
+    folders = [Path(f"litho_{package}/cli") for package in ("data", "models", "design")]
+    sources = {path: path.read_text("utf-8") for folder in folders for path in folder.glob("*.py")}
+    assert len(sources) > 10
+    assert not {
+        path.name: silent for path, text in sources.items() if (silent := silent_about_its_result(text))
+    }
+
+
+def test_a_command_that_does_not_say_what_to_open_is_found():
+    silent = "def make(out):\n    print('done')\n"
+    telling = "def _print_it(out):\n    print(out)\ndef tell(out):\n    _print_it(out)\n"
+    assert silent_about_its_result(silent + telling) == ["make"]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-NAMES = ("datasets", "models", "optics")
+NAMES = ("datasets", "models", "optics", "gallery")
 _INSTALL = (
     '# Where litholoop is installed already, this changes nothing.\n%pip install --quiet "litholoop[design]"'
 )

@@ -170,7 +170,11 @@ def _not_allowed(error: Exception) -> InputError | None:
         return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
     if isinstance(error, OSError):
         what = f"cannot use {error.filename}" if error.filename else "the system refuses"
-        return InputError(what, got=error, hint=_WAYS_OUT.get(error.errno or 0, _AGAIN))
+        # NumPy does not say why it has written less.
+        code = errno.ENOSPC if text.endswith(" written") else error.errno or 0
+        return InputError(what, got=error, hint=_WAYS_OUT.get(code, _AGAIN))
+    if "Symlink loop" in text:
+        return InputError("a link that leads to itself", got=text.partition("'")[2].rstrip("'"))
     if isinstance(error, RecursionError):
         return InputError("input", got="parts within parts, too deep", wanted="a flatter file")
     if isinstance(error, OverflowError):

@@ -1,4 +1,4 @@
-"""Releasing a store: as one file, or as an RO-Crate, a folder that describes itself."""
+"""Releasing a store: as one file, or as a folder that describes itself, in RO-Crate and in Croissant."""
 
 import json
 import zipfile
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.commands.progress import progress
+from litho_data.exchange.croissant import croissant
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
@@ -14,7 +15,7 @@ from litho_data.store.read import Store, open_store
 
 # Zip needs a time for every file; with a fixed one, the same store gives the same archive.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-_CRATE_FILE = "ro-crate-metadata.json"
+_CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
 
 
@@ -39,9 +40,10 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
 
 
 def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
-    """Write a release folder: the packed store, its quality table, and ``ro-crate-metadata.json``.
+    """Write a release folder: the packed store, its quality table, and what they are.
 
-    The metadata name every raw file with its SHA-256, the software of the build, licence and citation.
+    ``ro-crate-metadata.json`` names every raw file with its SHA-256, the software of the build, licence and
+    citation; ``croissant.json`` the files and the columns of the table.
 
     Raises:
         InputError: no store, a packed one, one without manifest, or a folder with something else in it.
@@ -49,22 +51,30 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
     store = open_store(store_path)
     if "card" not in store.manifest:
         raise InputError(f"{store_path} carries no manifest", wanted="a store made by litho-data build")
-    with whole_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE) as folder:
-        packed = export_zip(store_path, folder / f"{store.name}.zarr.zip")
-        store.quality.to_csv(folder / "quality.csv", index=False)
-        content = {
-            "@context": f"{_CRATE_VERSION}/context",
-            "@graph": _graph(store, packed, folder / "quality.csv"),
-        }
-        text = json.dumps(content, indent=1, ensure_ascii=False)
-        (folder / _CRATE_FILE).write_text(text + "\n", encoding="utf-8")
+    with whole_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE, _CROISSANT_FILE) as folder:
+        packed, table = folder / f"{store.name}.zarr.zip", folder / "quality.csv"
+        export_zip(store_path, packed)
+        store.quality.to_csv(table, index=False)
+        files = [
+            _file(packed, "application/zip", "Dataset store, Zarr v3 in one file"),
+            _file(table, "text/csv", "Registration, levelling and noise figures per scan"),
+        ]
+        root = _root(store)
+        _write(folder / _CROISSANT_FILE, croissant(root, files, table))
+        files.append(_file(folder / _CROISSANT_FILE, "application/ld+json", "The same in Croissant"))
+        content = {"@context": f"{_CRATE_VERSION}/context", "@graph": _graph(store, root, files)}
+        _write(folder / _CRATE_FILE, content)
     return Path(out)
 
 
-def _graph(store: Store, packed: Path, table: Path) -> list[dict[str, Any]]:
+def _write(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _root(store: Store) -> dict[str, Any]:
+    """What the dataset is."""
     manifest = store.manifest
-    card, software = manifest["card"], manifest["build"]["software"]
-    raw = [row for row in manifest["files"] if row["status"] == "ok"]
+    card = manifest["card"]
     root: dict[str, Any] = {
         "@id": "./",
         "@type": "Dataset",
@@ -73,13 +83,19 @@ def _graph(store: Store, packed: Path, table: Path) -> list[dict[str, Any]]:
         "description": f"{len(store)} printed fields measured by AFM and registered onto their layouts, "
         f"{store.pitch_um} µm per pixel, levels of {store.level_height_um} µm",
         "datePublished": manifest["build"]["started"][:10],
-        "hasPart": [{"@id": packed.name}, {"@id": table.name}],
-        "mentions": {"@id": "#build"},
     }
     if card.get("license"):
         root["license"] = {"@id": f"https://spdx.org/licenses/{card['license']}"}
     if card.get("citation"):
         root["citation"] = card["citation"]
+    return root
+
+
+def _graph(store: Store, root: dict[str, Any], files: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    manifest = store.manifest
+    build, raw = manifest["build"], [row for row in manifest["files"] if row["status"] == "ok"]
+    software, licence = build["software"], manifest["card"].get("license")
+    parts = [{"@id": one["@id"]} for one in files]
     return [
         {
             "@id": _CRATE_FILE,
@@ -87,17 +103,19 @@ def _graph(store: Store, packed: Path, table: Path) -> list[dict[str, Any]]:
             "conformsTo": {"@id": _CRATE_VERSION},
             "about": {"@id": "./"},
         },
-        root,
-        _file(packed, "application/zip", "Dataset store, Zarr v3 in one file"),
-        _file(table, "text/csv", "Registration, levelling and noise figures per scan"),
+        root | {"hasPart": parts, "mentions": {"@id": "#build"}},
+        *([{**root["license"], "@type": "CreativeWork", "name": licence}] if licence else []),
+        *files,
         {
             "@id": "#build",
             "@type": "CreateAction",
             "name": "Building the dataset from raw files",
-            "endTime": manifest["build"]["started"],
+            "startTime": build["started"],
+            # A store may be older than this.
+            **({"endTime": build["ended"]} if "ended" in build else {}),
             "instrument": {"@id": "#software"},
             "object": [{"@id": f"#raw/{row['path']}"} for row in raw],
-            "result": {"@id": packed.name},
+            "result": parts[0],
         },
         {
             "@id": "#software",

@@ -73,6 +73,8 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
         InputError: the place cannot be written, or another process is writing it.
     """
     target = Path(path)
+    if target.is_symlink() and not target.exists():
+        raise InputError(f"cannot write {target}", got="a link that leads nowhere", wanted="a folder's place")
     work = _work(target)
     while True:
         with writable(target):

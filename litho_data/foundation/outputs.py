@@ -27,7 +27,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             names.
     """
     folder = Path(path)
-    if folder.resolve() == Path.cwd():
+    if folder.exists() and folder.samefile(Path.cwd()):
         raise InputError("output", got=f"{folder}, the current folder", wanted="a folder in it, or elsewhere")
     _refuse_a_file(folder)
     names = sorted(child.name for child in folder.iterdir()) if folder.exists() else []

@@ -154,6 +154,7 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
         kept = [records[scan_id] for scan_id in sorted(records)]
         build = {
             "started": started.isoformat(),
+            "ended": datetime.now(UTC).isoformat(),
             "data_dir": _relative(source.data_dir, out.parent),
             "software": software_record(),
         }

@@ -1,25 +1,29 @@
-"""Creep: the scanner is still settling, and the lines of a scan are displaced along its slow axis.
+"""Scans that no straight warp fits: a scanner bends them, or it creeps.
 
-The displacement along both axes is a smooth function of the slow axis alone. A straight warp takes its linear
-part; what remains bends the print by a tenth of the creep, without any other sign.
+A bend displaces what is scanned by a quadratic function of the place. A scanner that is still settling
+displaces its lines along both axes by a smooth function of the slow axis alone. A straight warp takes the
+linear part of that; what remains bends the print by a tenth of the creep, without any other sign.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from litho_data.foundation.kinds import Array
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.geometry import apply_transform, lattice, warped_grid
-from litho_data.register.pyramid import FineFit, reduced_levels
+from litho_data.register.pyramid import FineFit, match_blur, project_to_model, reduced_levels
 from litho_data.register.refine import BORDER_PX, interior_of, refine
-from litho_data.register.topography import fill_gaps, quadratic_basis
+from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
 
+Curve = int | Literal["quadratic"] | None
+"""What is fitted beside an affine: the slow axis (0 = x, 1 = y) of a creep, a bend, or nothing."""
 # Every second pixel of the layout in both directions places the print as well as all of them.
 _EVERY = 2
-_ITERATIONS = 12
+_ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
 # Largest probability that held-out blocks prefer the creep by chance.
@@ -41,14 +45,7 @@ def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow:
         slow: axis of the oriented scan along which the lines follow each other, 0 = x, 1 = y.
     """
     straight_line = straight.refinement.layout_to_scan, Bend.none_yet(scan.shape)
-    crept = straight_line
-    for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
-        small = _Images(small_scan, small_topography)
-        scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
-        shrunk = scale @ crept[0] @ np.linalg.inv(scale), crept[1].scaled(1 / factor)
-        found = small.fit(*shrunk, slow, small.everywhere)
-        if found is not None:
-            crept = np.linalg.inv(scale) @ found[0] @ scale, found[1].scaled(factor)
+    crept = _from_coarse_to_fine(scan, layout_level, straight_line, slow)
     case = _Images(straight.scan, straight.topography, _EVERY)
     apart = np.diag([_EVERY, _EVERY, 1.0])
     whole = case.fit(crept[0] @ apart, crept[1], slow, case.everywhere)
@@ -56,9 +53,63 @@ def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow:
         return None
     if not _is_confirmed(case, (straight_line[0] @ apart, straight_line[1]), whole, slow):
         return None
-    matrix, bend = whole[0] @ np.linalg.inv(apart), whole[1]
-    refinement = refine(straight.scan, straight.topography, matrix, "affine", bend=bend, max_iterations=0)
-    return replace(straight, refinement=replace(refinement, converged=True))
+    return _with_bend(straight, whole[0] @ np.linalg.inv(apart), whole[1])
+
+
+def refine_bent(scan: Array, layout_level: Array, straight: FineFit) -> FineFit | None:
+    """The straight warp refined again, as an affine and a bend of the scan; None if that does not settle.
+
+    Args:
+        scan, layout_level: as in ``refine_pyramid``.
+        straight: what that returned; its error may reach the width of structures at a quarter resolution.
+    """
+    shape = layout_level.shape
+    affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
+    matrix, bend = _from_coarse_to_fine(scan, layout_level, (affine, Bend.none_yet(scan.shape)), "quadratic")
+    blur_px = match_blur(straight.scan, layout_level, matrix, bend)
+    topography = predicted_topography(layout_level, blur_px)
+    level = _without_own_bow(straight.scan, topography, warped_grid(matrix, shape, bend))
+    case = _Images(level, topography)
+    whole = case.fit(matrix, bend, "quadratic", case.everywhere)
+    fine = replace(straight, scan=level, topography=topography, blur_px=blur_px)
+    return None if whole is None else _with_bend(fine, *whole)
+
+
+def _with_bend(fine: FineFit, matrix: Array, bend: Bend) -> FineFit:
+    refinement = refine(fine.scan, fine.topography, matrix, "affine", bend=bend)
+    return replace(fine, refinement=replace(refinement, converged=True))
+
+
+def _from_coarse_to_fine(
+    scan: Array, layout_level: Array, found: tuple[Array, Bend], curve: Curve
+) -> tuple[Array, Bend]:
+    """Warp and bend, refined at a quarter and at half resolution."""
+    for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
+        small = _Images(small_scan, small_topography)
+        scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
+        shrunk = scale @ found[0] @ np.linalg.inv(scale), found[1].scaled(1 / factor)
+        refined = small.fit(*shrunk, curve, small.everywhere)
+        if refined is not None:
+            found = np.linalg.inv(scale) @ refined[0] @ scale, refined[1].scaled(factor)
+    return found
+
+
+def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
+    """The scan minus the quadratic surface that the topography does not explain.
+
+    A surface that is quadratic in the scan's frame, including the print's share of it, is not quadratic in
+    the layout's frame once the scan is straightened. It would distort the bend.
+    """
+    from scipy.ndimage import map_coordinates
+
+    basis = quadratic_basis(scan.shape)
+    places = tuple(one[::3, ::3] for one in grid)
+    warped = map_coordinates(fill_gaps(scan), places, order=1, cval=np.nan)
+    seen = np.isfinite(warped)
+    surfaces = [map_coordinates(one, places, order=1)[seen] for one in basis]
+    design = np.stack([topography[::3, ::3][seen], *surfaces], axis=1)
+    coefficients, *_ = np.linalg.lstsq(design, warped[seen], rcond=None)
+    return scan - np.einsum("k,kyx->yx", coefficients[1:], basis)
 
 
 def _is_confirmed(case: _Images, straight: tuple[Array, Bend], whole: tuple[Array, Bend], slow: int) -> bool:
@@ -99,25 +150,25 @@ class _Images:
         self._surface = [topography - topography.mean(), *quadratic_basis(shape)]
         self.everywhere = interior_of(shape, BORDER_PX // every)
 
-    def fit(self, matrix: Array, bend: Bend, slow: int | None, chosen: Array) -> tuple[Array, Bend] | None:
-        """Affine and, with a slow axis, creep by Gauss-Newton steps; None if they do not settle."""
+    def fit(self, matrix: Array, bend: Bend, curve: Curve, chosen: Array) -> tuple[Array, Bend] | None:
+        """Affine and curve by Gauss-Newton steps; None if they do not settle."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
         points = lattice(y, x)
         for _ in range(_ITERATIONS):
             warped, (rows, columns), inside = self._warped(matrix, bend)
             inside &= chosen & self.everywhere
-            flow = _flow(bend, columns[inside], rows[inside], slow)
+            flow = _flow(bend, columns[inside], rows[inside], curve)
             along = [gradient[inside] * one for gradient in self._gradient for one in flow]
             design = np.stack([*(one[inside] for one in self._surface), *along], axis=1)
             coefficients = _solve(design, warped[inside])
             if coefficients[0] <= 0:
                 return None
             motion = coefficients[1 + _BACKGROUND :].reshape(2, -1) / coefficients[0]
-            step_px = motion @ _flow(bend, points[:, 0], points[:, 1], slow)
+            step_px = motion @ _flow(bend, points[:, 0], points[:, 1], curve)
             if not np.abs(step_px).max() < 0.2 * min(self._measured.shape):
                 return None
             layout = apply_transform(np.linalg.inv(matrix), bend.straighten(points))
-            degree = 2 if slow is None else CREEP_DEGREE
+            degree = CREEP_DEGREE if isinstance(curve, int) else 2
             try:
                 moved = fit_bent_affine(points, layout + step_px.T, bend.middle, bend.half, degree)
             except np.linalg.LinAlgError:
@@ -145,12 +196,14 @@ class _Images:
         return warped.astype(float), places, seen
 
 
-def _flow(bend: Bend, x: Array, y: Array, slow: int | None) -> Array:
-    """What can move a point of the scan along one axis: 1, u, v, and Legendre polynomials of the slow one."""
-    unit = bend.unit(x, y)
-    flows = [np.ones_like(unit[0]), *unit]
-    if slow is not None:
-        flows += list(np.polynomial.legendre.legvander(unit[slow], CREEP_DEGREE).T[2:])
+def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
+    """What can move a point of the scan along one axis: 1, u, v, and what the curve has beyond."""
+    u, v = unit = bend.unit(x, y)
+    flows = [np.ones_like(u), u, v]
+    if curve == "quadratic":
+        flows += [u * u, u * v, v * v]
+    elif curve is not None:
+        flows += list(np.polynomial.legendre.legvander(unit[curve], CREEP_DEGREE).T[2:])
     return np.stack(flows)
 
 

@@ -14,7 +14,6 @@ from litho_data.register.topography import (
     fill_gaps,
     pearson,
     predicted_topography,
-    quadratic_basis,
     smooth_measured,
 )
 
@@ -55,7 +54,7 @@ def refine_pyramid(
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, layout_level.shape)
-    matrix, _ = _from_coarse_to_fine(scan, layout_level, coarse, low_model, None)
+    matrix = _from_coarse_to_fine(scan, layout_level, coarse, low_model)
     smooth_scan = _smooth(scan, SCAN_BLUR_PX)
     blur_px = match_blur(smooth_scan, layout_level, matrix)
     topography = predicted_topography(layout_level, blur_px)
@@ -65,60 +64,15 @@ def refine_pyramid(
     return FineFit(refinement, smooth_scan, topography, blur_px)
 
 
-def refine_bent(scan: Array, layout_level: Array, straight: FineFit) -> FineFit:
-    """Refine the best straight warp again, as an affine and a bend of the scan.
-
-    Args:
-        scan, layout_level: as in ``refine_pyramid``.
-        straight: what that returned; its error may reach the width of structures at a quarter resolution.
-    """
-    shape = layout_level.shape
-    matrix = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
-    bend: Bend | None = Bend.none_yet(scan.shape)
-    matrix, bend = _from_coarse_to_fine(scan, layout_level, matrix, "affine", bend)
-    blur_px = match_blur(straight.scan, layout_level, matrix, bend)
-    topography = predicted_topography(layout_level, blur_px)
-    level = _without_own_bow(straight.scan, topography, warped_grid(matrix, shape, bend))
-    refinement = refine(level, topography, matrix, "affine", bend=bend)
-    return FineFit(refinement, level, topography, blur_px)
-
-
-def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
-    """The scan minus the quadratic surface that the topography does not explain.
-
-    A surface that is quadratic in the scan's frame, including the print's share of it, is not quadratic in
-    the layout's frame once the scan is straightened. It would distort the bend.
-    """
-    from scipy.ndimage import map_coordinates
-
-    basis = quadratic_basis(scan.shape)
-    places = tuple(one[::3, ::3] for one in grid)
-    warped = map_coordinates(fill_gaps(scan), places, order=1, cval=np.nan)
-    seen = np.isfinite(warped)
-    surfaces = [map_coordinates(one, places, order=1)[seen] for one in basis]
-    design = np.stack([topography[::3, ::3][seen], *surfaces], axis=1)
-    coefficients, *_ = np.linalg.lstsq(design, warped[seen], rcond=None)
-    return scan - np.einsum("k,kyx->yx", coefficients[1:], basis)
-
-
-def _from_coarse_to_fine(
-    scan: Array, layout_level: Array, matrix: Array, model: Model, bend: Bend | None
-) -> tuple[Array, Bend | None]:
-    """Warp and bend, refined at a quarter and at half resolution."""
+def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model: Model) -> Array:
+    """The warp, refined at a quarter and at half resolution."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
-        found = refine(
-            small_scan,
-            small_topography,
-            scale @ matrix @ np.linalg.inv(scale),
-            model,
-            bend=None if bend is None else bend.scaled(1 / factor),
-            tolerance_px=0.02,
-        )
+        start = scale @ matrix @ np.linalg.inv(scale)
+        found = refine(small_scan, small_topography, start, model, tolerance_px=0.02)
         if found.converged:
             matrix = np.linalg.inv(scale) @ found.layout_to_scan @ scale
-            bend = None if found.bend is None else found.bend.scaled(factor)
-    return matrix, bend
+    return matrix
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:

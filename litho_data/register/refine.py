@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from litho_data.foundation.kinds import Array, Shape
-from litho_data.register.bend import Bend, fit_bent_affine
+from litho_data.register.bend import Bend
 from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
-from litho_data.register.geometry import apply_transform, corners, lattice, warped_grid
+from litho_data.register.geometry import apply_transform, corners, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
@@ -24,8 +24,6 @@ CELL_PX = 32
 # What surrounds the print is unknown (bare, or its neighbour) and blurs across the layout's border.
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
-# A bend folds from a slope of 1 on; an early step may overshoot that, but not by twice.
-HOPELESS_SLOPE = 2.0
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def refine(
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
         start: 3×3 index matrix, layout to scan, of the kind ``model``.
-        bend: of the scan, to start from; with one the warp is an affine and a bend, whatever the model.
+        bend: of the scan; the start is an affine then, and with the bend it is only evaluated.
         max_iterations: largest number of Gauss-Newton steps; 0 only evaluates the start.
         tolerance_px: the iteration ends at a step that moves every corner by less.
     """
@@ -107,31 +105,19 @@ def refine(
             inside &= map_coordinates(measured.astype(np.float32), (rows, columns), order=1) > 0.999
         warped = map_coordinates(spline, (rows, columns), order=3, mode="mirror", prefilter=False)
         coefficients = solve_gram(sums.gram(warped, inside))
-        if coefficients[0] <= 0:
+        if coefficients[0] <= 0 or bend is not None:
             break
-        if bend is None:
-            warp = coefficients[NUISANCES:] / coefficients[0]
-            increment = denormalise @ expm(np.einsum("k,kij->ij", warp, GENERATORS[: len(warp)])) @ normalise
-            motion_px = apply_transform(increment, corners(shape)) - corners(shape)
-        else:
-            motion_px = corner_motion_px(coefficients, shape, corners(shape))
+        warp = coefficients[NUISANCES:] / coefficients[0]
+        increment = denormalise @ expm(np.einsum("k,kij->ij", warp, GENERATORS[: len(warp)])) @ normalise
+        motion_px = apply_transform(increment, corners(shape)) - corners(shape)
         previous_px = step_px
         step_px = float(np.abs(motion_px).max())
         converged = step_px < tolerance_px
         diverges = not step_px < 0.5 * max(shape) or (iteration > 5 and step_px > 2 * previous_px)
         if converged or diverges or iteration == max_iterations:
             break
-        if bend is None:
-            matrix = matrix @ np.linalg.inv(increment)
-            matrix /= matrix[2, 2]
-        else:
-            try:
-                moved, further_bent = _moved_on(matrix, bend, coefficients, shape)
-            except np.linalg.LinAlgError:
-                break  # the scan shows too little of the layout to determine the step
-            if not further_bent.slope < HOPELESS_SLOPE:
-                break
-            matrix, bend = moved, further_bent
+        matrix = matrix @ np.linalg.inv(increment)
+        matrix /= matrix[2, 2]
     return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
 
 
@@ -188,21 +174,6 @@ def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
     """Pixels (ny, nx) away from the border, bool."""
     border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
-
-
-def _moved_on(matrix: Array, bend: Bend, coefficients: Array, shape: Shape) -> tuple[Array, Bend]:
-    """The warp after a step, again as an affine and a bend: higher orders vanish with the step.
-
-    Raises:
-        numpy.linalg.LinAlgError: the positions in and around the scan do not determine them.
-    """
-    y, x = (np.linspace(0, n - 1, 17) for n in shape)
-    layout = lattice(y, x)
-    scan = np.stack(bend.undo(*apply_transform(matrix, layout).T), axis=1)
-    reached = (np.abs(scan - bend.middle) < 2 * bend.half).all(axis=1)
-    moved = layout + corner_motion_px(coefficients, shape, layout)
-    to_layout, bend = fit_bent_affine(scan[reached], moved[reached], bend.middle, bend.half)
-    return np.linalg.inv(to_layout), bend
 
 
 def _regressors(topography: Array, count: int) -> Array:

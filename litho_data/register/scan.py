@@ -9,7 +9,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
-from litho_data.register.creep import refine_with_creep
+from litho_data.register.creep import refine_bent, refine_with_creep
 from litho_data.register.defects import refine_around_defects, without_defects
 from litho_data.register.evidence import BlockShifts, height_correlation, mutual_information_bit
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
@@ -23,7 +23,7 @@ from litho_data.register.geometry import (
     slow_axis,
 )
 from litho_data.register.orientation import rival_alignment
-from litho_data.register.pyramid import FineFit, climb, refine_bent, refine_pyramid
+from litho_data.register.pyramid import FineFit, climb, refine_pyramid
 from litho_data.register.quality import MAX_LAYOUT_REPEATS, RegistrationQuality, judge, unregistered_quality
 from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
@@ -127,15 +127,15 @@ def register_scan(
         with_creep, _ = case.registration(coarse, crept)
         if with_creep.quality.passed:
             found = [with_creep]
-    if not straight.quality.passed:
-        bent, _ = case.registration(coarse, refine_bent(oriented, layout, fine))
+    if not straight.quality.passed and (curved := refine_bent(oriented, layout, fine)) is not None:
+        bent, _ = case.registration(coarse, curved)
         found += [bent] if _explains(bent.quality, straight.quality) else []
     return min(found, key=lambda one: one.quality.tre_median_px, default=straight)
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
     """Whether a bend accounts for what the straight warp missed: within all limits, on blocks held out."""
-    return bent.passed and bent.converged and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
+    return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
 @dataclass(frozen=True)

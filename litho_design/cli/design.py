@@ -282,10 +282,10 @@ def _settings(
 
 
 def _print_comparison(result: GapResult, out: Path) -> None:
-    from litho_design.judging.gap import headline
+    from litho_design.judging.loaded import task_named
 
     for item in result.summary:
-        if item.figure == headline(result.task)[0]:
+        if item.figure == task_named(result.task).headline[0]:
             print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
     print(out / "report.html")
 

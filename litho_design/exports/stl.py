@@ -1,4 +1,4 @@
-"""Layouts as a closed solid (binary STL, µm)."""
+"""Layouts as a closed solid (binary STL, µm): two triangles a top; walls meet corner to corner."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_design.exports.step_solid import step_solid
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER_BYTES = 80
+# Where columns touch along an edge only, the higher one keeps this share of a cell away from it.
+_APART = 1 / 128
+# Ways (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
+_WAY = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)], np.float32)
+_BELOW = -1
 
 
 def write_stl(
@@ -43,3 +47,95 @@ def write_stl(
         stream.write(np.uint32(len(records)).astype("<u4").tobytes())
         stream.write(records.tobytes())
     return len(records)
+
+
+def step_solid(levels: np.ndarray) -> np.ndarray:
+    """Triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
+
+    Every edge has two faces, which meet it in opposite directions: a wall has a corner wherever one of the
+    four columns around its ends has its top.
+
+    Args:
+        levels: integers (ny, nx) of 0 or more; y grows with the row.
+
+    Returns:
+        x and y in cells, z in levels, with -1 for the underside; counter-clockwise from outside.
+    """
+    cells = np.pad(np.asarray(levels, np.int16), 1, constant_values=_BELOW)
+    around = np.stack([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=-1)
+    aside = np.zeros(around.shape, bool)
+    for high, low in (([0, 3], [1, 2]), ([1, 2], [0, 3])):
+        touch = around[..., high].min(-1) > around[..., low].max(-1)
+        first = touch & (around[..., high[0]] >= around[..., high[1]])
+        aside[..., high[0]] |= first
+        aside[..., high[1]] |= touch & ~first
+    turned = [0, 2, 1, 3]
+    across = _walls(cells.T, around.swapaxes(0, 1)[..., turned], aside.swapaxes(0, 1)[..., turned])
+    return np.concatenate(
+        [
+            _tops(around, aside),
+            _walls(cells, around, aside),
+            across[:, ::-1, [1, 0, 2]],
+            _underside(levels.shape),
+        ]
+    )
+
+
+def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Places (n, 3) over points (n, 2), row and column, of which some are moved towards a cell."""
+    at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
+    return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)
+
+
+def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    """Two triangles for each cell."""
+    cell = np.argwhere(around[:-1, :-1, 3] >= 0)
+    z = around[cell[:, 0], cell[:, 1], 3]
+    # Of the cell its point in the south-west, where the cell itself lies north-east, and so on around.
+    corners = []
+    for step, way in (((0, 0), 3), ((0, 1), 2), ((1, 1), 0), ((1, 0), 1)):
+        point = cell + step
+        corners.append(_corner(point, z, way, aside[point[:, 0], point[:, 1], way]))
+    a, b, c, d = corners
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    """Triangles of the walls between rows of cells."""
+    row, column = np.nonzero(cells[:-1, 1:-1] != cells[1:, 1:-1])
+    south, north = cells[row, column + 1], cells[row + 1, column + 1]
+    low, high = np.minimum(south, north), np.maximum(south, north)
+    ends = []
+    # The higher cell, seen from the end in the west and from that in the east.
+    for point, place in (
+        (np.stack([row, column], 1), np.where(north > south, 3, 1)),
+        (np.stack([row, column + 1], 1), np.where(north > south, 2, 0)),
+    ):
+        at = (point[:, 0], point[:, 1])
+        moved, levels = aside[*at, place], around[at].copy()
+        # The edge of a moved column passes the column that it was moved from.
+        opposite = np.arange(len(row)), 3 - place
+        levels[opposite] = np.where(moved, low, levels[opposite])
+        chain = np.sort(levels.clip(low[:, None], high[:, None]), axis=1)
+        ends.append([_corner(point, z, place, moved & (z == high)) for z in chain.T])
+    west, east = ends
+    strips = [(west[0], east[i], east[i + 1]) for i in range(3)]
+    strips += [(west[i], east[3], west[i + 1]) for i in range(3)]
+    found = []
+    for a, b, c in strips:
+        # Counter-clockwise as seen from the south; a wall faces its lower cell.
+        faces = np.where((south > north)[:, None, None], np.stack([c, b, a], 1), np.stack([a, b, c], 1))
+        corners_apart = (a != b).any(1) & (b != c).any(1) & (c != a).any(1)
+        found.append(faces[corners_apart])
+    return np.concatenate(found)
+
+
+def _underside(shape: tuple[int, ...]) -> np.ndarray:
+    """A fan from the middle to all points of the rim."""
+    ny, nx = shape
+    south, east = [(0, x) for x in range(nx)], [(y, nx) for y in range(ny)]
+    north, west = [(ny, x) for x in range(nx, 0, -1)], [(y, 0) for y in range(ny, 0, -1)]
+    rim = np.array([*south, *east, *north, *west], float)
+    corners = np.concatenate([rim[:, ::-1], np.full((len(rim), 1), _BELOW)], axis=1)
+    middle = np.broadcast_to([nx / 2, ny / 2, _BELOW], corners.shape)
+    return np.stack([middle, np.roll(corners, -1, axis=0), corners], axis=1).astype(np.float32)

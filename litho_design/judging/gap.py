@@ -13,21 +13,11 @@ import numpy as np
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_design.holograms.settings import HologramSettings
-from litho_design.judging.loaded import task_named
 from litho_design.lenses.settings import LensSettings
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import PrinterRecord
 from litho_design.reliefs.settings import ReliefSettings
 from litho_design.tasks.design import DESIGNS
-
-
-def headline(task: str) -> tuple[str, ...]:
-    """The figures of a task that a comparison ranks by; none where the task names none.
-
-    Raises:
-        InputError: a task that is not registered.
-    """
-    return task_named(task).headline
 
 
 class GapEntry(Record):

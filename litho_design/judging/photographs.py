@@ -19,10 +19,10 @@ from litho_design.images.photograph import CameraRecord, Photograph, PhotoSource
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.lenses.bench import reconstruct, sensor_psf
+from litho_design.lenses.bench import sensor_psf
 from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.lenses.task import LensTask
-from litho_design.optics.imaging import Blur
+from litho_design.optics.imaging import Blur, richardson_lucy
 
 # A score that is less sure decides nothing between designs.
 _LARGEST_SD_DB = 0.5
@@ -164,7 +164,7 @@ def score_lens_photo(
     def estimates(image: np.ndarray) -> dict[str, Tensor]:
         seen = torch.from_numpy(image).to(expected).clamp(min=0)
         seen = seen * matched_scale(seen, expected)
-        found = {name: reconstruct(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
+        found = {name: richardson_lucy(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
         return {
             name: image * matched_scale(image, wanted) for name, image in ({"direct": seen} | found).items()
         }

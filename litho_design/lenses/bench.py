@@ -17,7 +17,7 @@ from litho_design.optics import (
     intensity_share,
     make_propagator,
 )
-from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
+from litho_design.optics.imaging import Blur, bin_pixels
 from litho_design.optics.source import require_one_wave
 from litho_design.printers.layout import LayoutSettings
 
@@ -154,8 +154,3 @@ def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) ->
         return image + imaging.read_noise * noise
     variance = imaging.read_noise**2 + imaging.photon_noise * image.detach().clamp(min=0)
     return image + variance.sqrt() * noise
-
-
-def reconstruct(recorded: Tensor, psf: Tensor, iterations: int) -> Tensor:
-    """Richardson-Lucy estimate of the objects with the given PSF."""
-    return richardson_lucy(recorded, psf, iterations=iterations)

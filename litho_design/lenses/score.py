@@ -15,12 +15,12 @@ from litho_design.images.similarity import similarity
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
-    reconstruct,
     record,
     sensor_psf,
 )
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, LensSettings
+from litho_design.optics.imaging import richardson_lucy
 
 # Figures of a lens that make sense where nothing focuses.
 _OF_POWER = ("focusing_efficiency", "strehl", "cbr", "eff_window")
@@ -144,8 +144,8 @@ def imaging_score(
         seen = record(objects, real, settings, seed)
         scale = (seen * objects).sum((-2, -1)) / seen.square().sum((-2, -1))
         add("direct", seen * scale[:, None, None])
-        add("design", reconstruct(seen, expected, settings.iterations))
-        add("calibrated", reconstruct(seen, real, settings.iterations))
+        add("design", richardson_lucy(seen, expected, settings.iterations))
+        add("calibrated", richardson_lucy(seen, real, settings.iterations))
     figures = {name: sum(values) / len(values) for name, values in rows.items()}
     figures |= {f"{name}_sd": float(torch.tensor(values).std()) for name, values in rows.items()}
     return ImagingScore(**{name: figures[name] for name in ImagingScore.model_fields})

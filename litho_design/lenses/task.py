@@ -17,7 +17,6 @@ from litho_design.images.targets import TargetRecord
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
-    reconstruct,
     record,
     sensor_psf,
 )
@@ -31,6 +30,7 @@ from litho_design.lenses.score import (
 )
 from litho_design.lenses.settings import SMOOTH_BELOW, LensSettings
 from litho_design.optics import Optics
+from litho_design.optics.imaging import richardson_lucy
 from litho_design.optimisation.phases import focusing_levels, fresnel_lens_phase
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -196,7 +196,7 @@ class ComputationalLensTask(LensTask):
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
         image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
-        estimate = reconstruct(image, kernel, imaging.iterations)
+        estimate = richardson_lucy(image, kernel, imaging.iterations)
         if imaging.loss == "smooth-l1":
             error = smooth_l1_loss(estimate, self.objects, beta=SMOOTH_BELOW)
         else:

@@ -57,7 +57,7 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
     return blocks.sum((-3, -1))
 
 
-def richardson_lucy(recorded: Tensor, psf: Tensor, *, iterations: int = 50) -> Tensor:
+def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tensor:
     """Estimate the object behind a recorded image.
 
     e <- e * H^T (b / H e) / (H^T 1), from a flat start of the right flux (Richardson 1972, Lucy

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import ReduceLROnPlateau, StepLR
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
@@ -18,8 +19,7 @@ from litho_design.optimisation.checkpoint import (
     save_checkpoint,
 )
 from litho_design.optimisation.parameters import Parametrisation
-from litho_design.optimisation.rate import lower_rate, rate_schedule
-from litho_design.optimisation.settings import SearchSettings
+from litho_design.optimisation.settings import PROGRESS, SearchSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
 
@@ -112,3 +112,22 @@ def _evaluate(
     )
     if settings.keep == "last" or value < state.best_loss:
         state.best_loss, state.best_levels = value, levels.clone()
+
+
+def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) -> StepLR | ReduceLROnPlateau:
+    """What lowers the rate of ``optimiser`` as the settings say; its state goes into the checkpoint."""
+    factor, iterations = settings.rate_factor, settings.rate_iterations
+    if settings.rate_schedule == "plateau":
+        # Relative to the loss, PyTorch's own, a threshold is none where a loss is negative.
+        return ReduceLROnPlateau(
+            optimiser, factor=factor, patience=iterations, threshold=PROGRESS, threshold_mode="abs"
+        )
+    return StepLR(optimiser, iterations, factor if settings.rate_schedule == "step" else 1.0)
+
+
+def lower_rate(schedule: StepLR | ReduceLROnPlateau, loss: float) -> None:
+    """An iteration has been made, and its sample had this loss."""
+    if isinstance(schedule, ReduceLROnPlateau):
+        schedule.step(loss)
+    else:
+        schedule.step()

@@ -43,7 +43,10 @@ def load_printer(
         return Printer(None, layout, source=source, name=name).to(device)
     if is_fab(source):
         return Printer(load_fab(source, layout), layout, source=source, name=name).to(device)
-    simulator = _load_simulator(source, device, extrapolate)
+    from litho_models import load_frozen, zoo
+
+    folder = zoo.model_folder(source, other=["none"])
+    simulator = load_frozen(folder, device=device, extrapolate=extrapolate)
     _check_calibration(simulator.card, layout, extrapolate)
     return Printer(simulator, layout, source=source, name=name, extrapolate=extrapolate).to(device)
 
@@ -104,12 +107,6 @@ def models_at_hand(
         if printer.weights_sha256() not in weights:
             found.append(printer)
     return found
-
-
-def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:
-    from litho_models import load_frozen, zoo
-
-    return load_frozen(zoo.model_folder(source, other=["none"]), device=device, extrapolate=extrapolate)
 
 
 def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:

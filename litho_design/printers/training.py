@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
 from litho_data.foundation.results import Record
 from litho_design.printers.layout import LayoutSettings
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Half of the pixels at levels that the training layouts hardly have: mostly extrapolation.
 _FLAG_DISTANCE = 0.5
@@ -72,6 +76,31 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
     if trained.size == 0:
         return None
     return np.pad(trained / trained.sum(), (0, max(0, levels - trained.size)))
+
+
+def own_error_um(
+    card: Mapping[str, Any], height_um: Tensor, pitch_um: float, relief_um: float
+) -> Tensor | float:
+    """Rms error that a model has by its card on a print (ny, nx), µm, as it had on those it was made of.
+
+    It grows with the square of the rms slope, as what models miss at edges does, and with the relief that is
+    wanted (its standard deviation), where these exceed those of the older prints. Gains vary, too. The mean
+    absolute error of normal errors is sqrt(2 / pi) of the rms one. 0 where the card has no prints.
+    """
+    import torch
+
+    prints = card.get("baseline") or []
+    if not prints:
+        return 0.0
+    error_nm, relief_nm, steepness, gain = (
+        np.array([one[name] for one in prints], float)
+        for name in ("error_nm", "relief_nm", "steepness", "gain")
+    )
+    slopes = torch.stack(torch.gradient(height_um, spacing=pitch_um)).square().sum(0).mean().sqrt()
+    least = max(1.0, 1e3 * relief_um / float(relief_nm.mean()))
+    times = ((slopes / steepness.mean()) ** 2).clamp(min=least)
+    error_um = math.sqrt(math.pi / 2) * 1e-3 * float(error_nm.mean()) * times
+    return (error_um**2 + (float(gain.std()) * relief_um) ** 2).sqrt()
 
 
 def _distance(share: np.ndarray, trained: np.ndarray) -> float:

@@ -19,6 +19,7 @@ from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import own_error_um
 from litho_design.reliefs.settings import ReliefSettings
 from litho_design.tasks.task import Task, register_task
 
@@ -63,6 +64,7 @@ class ReliefTask(Task):
     name = "relief"
     starts = ("inverse", "random")
     headline = errors = ("rms_nm", "mae_nm", "p95_nm")
+    loss_unit = 1e3
     score_type = ReliefScore
     settings_type = ReliefSettings
     settings: ReliefSettings
@@ -97,6 +99,12 @@ class ReliefTask(Task):
     def loss(self, seen: Tensor) -> Tensor:
         """Rms error without its mean, µm."""
         return (seen - self.asked).std(correction=0)
+
+    def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """The rms error to be expected, µm: that of the model's print, and the model's own."""
+        rms_um = self.loss(seen)
+        own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
+        return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
 
     def figures(self, seen: Tensor) -> dict[str, float]:
         """Errors, nm."""
@@ -162,7 +170,7 @@ class ReliefTask(Task):
     def _worst_loss(self, levels: Tensor) -> float:
         """Largest loss of real levels (*cells), rounded, over the printers of the search."""
         whole = self.cells(levels.round())[None, None].float()
-        return max(float(self.loss(printer(whole)[0, 0])) for printer in self.printers)
+        return max(float(self.loss_by(printer, printer(whole)[0, 0])[0]) for printer in self.printers)
 
     def thick_score(self, height_um: Tensor) -> None:
         """A height is a height, whatever the light."""

@@ -78,6 +78,9 @@ def width_sentence(design: Design) -> str:
     by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
     text = spread_sentence(width.figure, by_model, width.less, width.gain)
     text += f" The search used {width.searched_with} of them."
+    low, high = width.between
+    if high > max(by_model.values()):
+        text += f" With the error that they had on their own prints, expect {low:.3g} to {high:.3g}."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (

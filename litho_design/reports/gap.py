@@ -10,7 +10,7 @@ import numpy as np
 
 from litho_data.reports.page import Page, capitalised
 from litho_design.holograms.bench import HologramScore
-from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
+from litho_design.judging.gap import GapResult, PairedDifference, design_folder
 from litho_design.judging.loaded import LoadedDesign, task_named
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
@@ -35,7 +35,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         if result.task == "hoe"
         else result.task.replace("lens-", "lens, ").replace("-", " ")
     )
-    shown = headline(result.task)
+    shown = task_named(result.task).headline
     page = Page(
         "The design-to-manufacturing gap",
         f"{capitalised(what)}, designed with {_listed(result.arms)}; {result.settings.search.iterations} "

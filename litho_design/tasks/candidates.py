@@ -27,7 +27,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
     for name, level in candidates.items():
         seen = {model: task.bench(one(level[None, None].float())[0, 0]) for model, one in models.items()}
         figures[name] = {
-            model: {"loss": float(task.loss_and_parts(one)[0]), **task.window_figures(one)}
+            model: {"loss": float(task.loss_by(models[model], one)[0]), **task.window_figures(one)}
             for model, one in seen.items()
         }
     returned = min(figures, key=lambda name: max(one["loss"] for one in figures[name].values()))
@@ -39,5 +39,6 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         returned=returned,
         figure=figure,
         less=figure in (*task.errors, "loss"),
+        loss_unit=task.loss_unit,
         level_heights_um={model: list(one.level_heights_um()) for model, one in models.items()},
     )

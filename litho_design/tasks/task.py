@@ -58,7 +58,7 @@ class Task:
         name: in results; one for every task.
         starts: starts of the search that make sense; ``start_jitter_levels``: noise that they get.
         headline: figures that reports and commands show first; all of them where empty.
-        errors: figures that are better when lower.
+        errors: figures that are better when lower; ``loss_unit``: see ``Width``.
         polished, reported: whether the search ends with single-level changes, and the run with a page.
         part, leads: its checkpoint, and whether it writes the record, where several processes share it.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
@@ -81,6 +81,7 @@ class Task:
     start_jitter_levels = 0.0
     headline: ClassVar[tuple[str, ...]] = ()
     errors: ClassVar[tuple[str, ...]] = ()
+    loss_unit: ClassVar[float | None] = None
     score_type: ClassVar[type[Record]] = Figures
     settings_type: ClassVar[type[DesignSettings]] = DesignSettings
     polished = reported = leads = True
@@ -280,7 +281,8 @@ class Task:
         parts: dict[str, float] = {}
         for draw, bench in self.scenes:
             drawn = [one if draw is None else draw.apply(one, settings.layout.pitch_um) for one in prints]
-            found = [self.loss_and_parts(bench(height)) for height in drawn]
+            seen = [bench(height) for height in drawn]
+            found = [self.loss_by(one, image) for one, image in zip(self.printers, seen, strict=True)]
             parts = parts or found[0][1]
             of_models = torch.stack([loss for loss, _ in found])
             losses.append(of_models.max())
@@ -315,8 +317,8 @@ class Task:
             digest.update(_source(type(self)).encode())
         return digest.hexdigest()
 
-    def loss_and_parts(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """What ``loss`` gives, its named parts beside it."""
+    def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """Loss of what is seen of a print by this model, its named parts beside it: what ``loss`` gives."""
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})
 

@@ -7,6 +7,8 @@ import numpy as np
 from litho_data.foundation.results import Record
 
 SEARCHED = "searched"
+# Of normal errors 95 % lie within twice their standard deviation.
+_SURE = 2.0
 
 
 class Width(Record):
@@ -18,6 +20,8 @@ class Width(Record):
             doing nothing.
         returned: the candidate whose largest loss over the models is the smallest.
         figure: the first one of the task; ``less``: whether it is better when lower.
+        loss_unit: what turns a loss into the figure with the error of the model itself; None where it is no
+            such error.
         level_heights_um: printed height of a wide field of each level, by model.
     """
 
@@ -26,12 +30,24 @@ class Width(Record):
     returned: str
     figure: str
     less: bool
+    loss_unit: float | None = None
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
         """The figure of a candidate, by default of the returned one, by every model."""
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
+
+    @property
+    def between(self) -> tuple[float, float]:
+        """Where the figure of a print is to be expected: among models, and off by twice their own error."""
+        values = self.values()
+        if self.loss_unit is None:
+            return float(values.min()), float(values.max())
+        losses = np.array([one["loss"] for one in self.figures[self.returned].values()])
+        own_squared = ((self.loss_unit * losses) ** 2 - values**2).clip(min=0)
+        low, high = (np.sqrt((values**2 + sign * _SURE**2 * own_squared).clip(min=0)) for sign in (-1, 1))
+        return float(low.min()), float(high.max())
 
     @property
     def gain(self) -> float | None:

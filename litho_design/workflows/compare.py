@@ -23,11 +23,10 @@ from litho_design.judging.gap import (
     GapEntry,
     GapResult,
     design_folder,
-    headline,
     paired_differences,
     summarise,
 )
-from litho_design.judging.loaded import load_design
+from litho_design.judging.loaded import load_design, task_named
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import lens_task
@@ -124,6 +123,7 @@ def compare(
             for arm, seed in itertools.product(designers, every_seed)
             for entry in _judged(design_folder(folder, arm, seed), arm, seed, everyone)
         ]
+        shown = task_named(designs[0].task).headline
         result = GapResult(
             task=designs[0].task,
             **run_facts(),
@@ -134,7 +134,7 @@ def compare(
             judges={name: printer.record() for name, printer in everyone.items()},
             entries=entries,
             summary=summarise(entries),
-            paired=paired_differences(entries, headline(designs[0].task) or tuple(designs[0].predicted)),
+            paired=paired_differences(entries, shown or tuple(designs[0].predicted)),
         )
         write_gap_report(folder, result, everyone)
         result.write(folder)

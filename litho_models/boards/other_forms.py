@@ -208,7 +208,7 @@ def _cubic_slope_loss(rng: np.random.Generator) -> Law:
     )
 
 
-@_form("diagonal-slope-loss", "surface", "µm", 4.0)
+@_form("diagonal-slope-loss", "surface", "µm", 4.0, names=("slope-thinning",))
 def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
     """Height lost per squared slope along a direction at 30–60° to the axes."""
     direction = rng.uniform(np.pi / 6, np.pi / 3) + rng.integers(2) * np.pi / 2

@@ -1,7 +1,5 @@
 """`litho-models close-loop`, `next-print`, `check`: what a model lacks, what would tell, is it still so?"""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """`litho-models noise`: what no model of the printer can predict."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +44,7 @@ def noise(
     Example: litho-models noise prints.zarr --residuals benchmark --out noise
     """
     from litho_models.noise import analyse_noise_of_files
+    from litho_models.noise.report import noise_verdict
 
     _check_given(context)
     if store is not None:
@@ -60,15 +59,7 @@ def noise(
             size_um=size_um,
             level_height_um=level_height_um,
         )
-    floor = result.noise_floor
-    typer.echo(
-        f"noise floor ({floor.kind}): "
-        + (
-            "not known"
-            if floor.mae_nm is None
-            else f"MAE {floor.mae_nm:.2f} nm, sigma {floor.rmse_nm:.2f} nm"
-        )
-    )
+    typer.echo(noise_verdict(result.noise_floor))
     if result.dose is not None:
         typer.echo(f"recommended dose {result.dose.recommended_dose:g}: {result.dose.reason}")
     typer.echo(f"report {out / 'report.html'}")

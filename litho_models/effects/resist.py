@@ -166,21 +166,25 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
         "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
         "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
         "exponent": Parameter("1", 0.7, 3.0, 2.0, "shape"),
+        "turn_deg": Parameter("deg", -45.0, 45.0, 0.0, "shape"),
     },
     role="undetermined",
     trials=tuple(
-        {**axes, "exponent": power}
+        {**axes, "exponent": power, "turn_deg": turn}
         for power in (1.0, 2.0)
+        for turn in (0.0, 45.0)
         for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
     ),
-    source="empirical: loss along a power of the slope, one coefficient per axis",
+    source="empirical: loss along a power of the slope, one coefficient per axis of a turned frame",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - cx |dH/dx|^p - cy |dH/dy|^p: height missing on slopes, by axis.
+    """H - cx |dH/dx'|^p - cy |dH/dy'|^p: height missing on slopes, by axis; x' and y' are turned.
 
     p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
     """
-    power = values["exponent"]
-    along_y, along_x = (rounded_power(slope**2, power) for slope in gradient(height, context.pitch_um))
+    power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
+    y, x = gradient(height, context.pitch_um)
+    along_x = rounded_power((turn.cos() * x + turn.sin() * y) ** 2, power)
+    along_y = rounded_power((turn.cos() * y - turn.sin() * x) ** 2, power)
     return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y

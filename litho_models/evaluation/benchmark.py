@@ -3,8 +3,6 @@
 An interrupted benchmark resumes, and an unchanged fit is never repeated.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence

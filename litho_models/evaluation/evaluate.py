@@ -1,7 +1,5 @@
 """One frozen model on a dataset: ``evaluation.json`` and a report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

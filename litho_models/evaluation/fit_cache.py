@@ -3,8 +3,6 @@
 Each (model, fold) is a folder of its own, named by the hash of everything that decides it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.models import build_model
 from litho_models.prediction.cost import PredictionCost, measured_predictions
-from litho_models.prediction.tiles import predict_scan, tile_difference
+from litho_models.prediction.tiles import TileDifference, predict_scan, tile_difference
 from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scan_terms.measurement import MeasurementModel
@@ -30,14 +28,6 @@ from litho_models.scoring.metrics import mean_error_nm
 from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
-
-
-class TileConsistency(Record):
-    """The same pixels predicted in the whole field and in a crop of it, nm."""
-
-    max_nm: float
-    rms_nm: float
-    pixels: int
 
 
 class FitDiagnostics(Record):
@@ -53,7 +43,7 @@ class FitDiagnostics(Record):
     training_nm: float
     inner_validation_nm: float | None
     held_out_nm: float
-    tiles: TileConsistency | None
+    tiles: TileDifference | None
     cost: PredictionCost
 
 
@@ -89,7 +79,7 @@ def diagnose(
     )
 
 
-def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileConsistency | None:
+def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileDifference | None:
     """Difference between a scan's field and a crop of it that lacks a third of the rows and columns.
 
     Pixels within the receptive radius of the crop's edge are not compared, nor those within one tile
@@ -102,7 +92,7 @@ def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileConsisten
     if any(length - cut <= 2 * border for length, cut in zip(scan.shape, offset, strict=True)):
         return None
     layout = torch.from_numpy(scan.layout_um)[None, None].to(device_of(model))
-    return TileConsistency(**tile_difference(model, layout, offset, border)._asdict())
+    return tile_difference(model, layout, offset, border)
 
 
 def device_of(model: torch.nn.Module) -> str:

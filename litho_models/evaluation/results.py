@@ -13,8 +13,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.evaluation.fit_cache import FitRecord, TileConsistency
+from litho_models.evaluation.fit_cache import FitRecord
 from litho_models.prediction.cost import PredictionCost
+from litho_models.prediction.tiles import TileDifference
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, Paired, paired_scores
@@ -31,7 +32,7 @@ class ModelRecord(Record):
     sha256: str
     extrapolated: bool
     parameters: int | None = None
-    tiles: TileConsistency | None = None
+    tiles: TileDifference | None = None
     cost: PredictionCost | None = None
 
 

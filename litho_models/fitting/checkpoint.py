@@ -1,21 +1,18 @@
 """What a killed run needs to go on: weights, optimiser moments, the best weights, the history."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+from pickle import UnpicklingError
 
 import torch
 from pydantic import BaseModel, ConfigDict
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
-from litho_models.frozen.files import write_tensors
 from litho_models.simulator import Simulator
 
 
@@ -38,7 +35,6 @@ class TrainingState:
         self.optimiser = optimiser
         self.history: list[RoundRecord] = []
         self.best: dict[str, Tensor] = {}
-        self._best_error: float | None = None
 
     @property
     def step(self) -> int:
@@ -47,38 +43,29 @@ class TrainingState:
 
     def record(self, record: RoundRecord) -> None:
         """Add a round; keep the weights where it is the best, or where there is nothing to judge by."""
-        self.history.append(record)
+        errors = [entry.validation_mae_datum_free_nm for entry in self.history]
         error = record.validation_mae_datum_free_nm
-        if error is None or self._best_error is None or error < self._best_error:
-            self._best_error = error
+        if error is None or all(one is None or error < one for one in errors):
             self.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+        self.history.append(record)
 
     def restore_best(self) -> None:
         """Load the weights of the best round."""
         self.model.load_state_dict(self.best)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything in one flat mapping."""
-        named = {f"model.{name}": value for name, value in self.model.state_dict().items()}
-        named |= {f"best.{name}": value for name, value in self.best.items()}
-        for index, moments in self.optimiser.state_dict()["state"].items():
-            named |= {f"optimiser.{index}.{name}": torch.as_tensor(v) for name, v in moments.items()}
-        return {name: value.detach().cpu().contiguous() for name, value in named.items()}
+    def save(self, file: Path) -> None:
+        """Write weights, best weights and moments."""
+        buffer = BytesIO()
+        torch.save((self.model.state_dict(), self.best, self.optimiser.state_dict()), buffer)
+        # Not by torch itself, whose error on a full disk is no OSError.
+        file.write_bytes(buffer.getvalue())
 
-    def load(self, tensors: dict[str, Tensor], history: list[RoundRecord]) -> None:
-        """The inverse of ``tensors``."""
-        self.model.load_state_dict(_with_prefix(tensors, "model."))
-        self.best = _with_prefix(tensors, "best.")
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in _with_prefix(tensors, "optimiser.").items():
-            index, moment = name.split(".", 1)
-            moments.setdefault(int(index), {})[moment] = value
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
+    def load(self, file: Path, history: list[RoundRecord]) -> None:
+        """The inverse of ``save``; the file can hold tensors and numbers only, and nothing in it is run."""
+        weights, self.best, moments = torch.load(file, map_location="cpu", weights_only=True)
+        self.model.load_state_dict(weights)
+        self.optimiser.load_state_dict(moments)
         self.history = list(history)
-        errors = [
-            r.validation_mae_datum_free_nm for r in history if r.validation_mae_datum_free_nm is not None
-        ]
-        self._best_error = min(errors, default=None)
 
 
 @contextmanager
@@ -92,7 +79,7 @@ def reading_kept(folder: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, SafetensorError) as error:
+    except (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, UnpicklingError) as error:
         said = str(error).partition("\n")[0]
         raise InputError(
             f"cannot read what an earlier call kept in {folder}",
@@ -117,7 +104,7 @@ class CheckpointFolder:
     def save(self, state: TrainingState) -> None:
         """Replace the checkpoint as a whole."""
         with atomic_folder(self.path) as folder:
-            write_tensors(state.tensors(), folder / "state.safetensors")
+            state.save(folder / "state.pt")
             record = {"key": self._key, "history": [entry.model_dump() for entry in state.history]}
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
@@ -129,7 +116,7 @@ class CheckpointFolder:
         """
         if self._kept:
             with reading_kept(self.path):
-                state.load(load_file(self.path / "state.safetensors"), self._kept)
+                state.load(self.path / "state.pt", self._kept)
 
     def _kept_history(self) -> list[RoundRecord]:
         file = self.path / "state.json"
@@ -146,7 +133,3 @@ class CheckpointFolder:
                 hint="choose another --out, or delete the folder",
             )
         return history
-
-
-def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)}

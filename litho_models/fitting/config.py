@@ -1,7 +1,5 @@
 """How a model is trained: one frozen, explicit record, saved with every run."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field

@@ -1,7 +1,5 @@
 """Crops of scans with their surroundings: which ones, and how they are cut."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fit any model to printed scans: the one entry that commands, benchmark and loop call."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

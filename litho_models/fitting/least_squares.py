@@ -14,8 +14,10 @@ from typing import Literal, Protocol
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from litho_data.foundation.kinds import Array
+
 Loss = Literal["absolute", "squares"]
-Room = tuple[np.ndarray, np.ndarray]
+Room = tuple[Array, Array]
 
 # Residuals below this count squared: far below the noise of a print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
@@ -35,21 +37,21 @@ class Linearised:
         basis: what the scan may add by itself, (k, n).
     """
 
-    residual: np.ndarray
-    jacobian: np.ndarray
-    basis: np.ndarray
+    residual: Array
+    jacobian: Array
+    basis: Array
 
 
 class Problem(Protocol):
     """What is fitted, scan by scan."""
 
-    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+    def linearise(self, vector: Array) -> list[Linearised]:
         """All scans at these parameters."""
 
-    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+    def residuals(self, vector: Array) -> list[Array]:
         """Measured minus predicted (n,) of all scans, µm."""
 
-    def room(self, vector: np.ndarray) -> Room | None:
+    def room(self, vector: Array) -> Room | None:
         """Smallest and largest step (p,) allowed from here; None where any is."""
 
 
@@ -81,13 +83,13 @@ class Rules:
 class LeastSquaresFit:
     """Fitted parameters (p,), the scans at them, and the loss after each step."""
 
-    vector: np.ndarray
+    vector: Array
     linear: list[Linearised]
     losses: list[float]
 
 
 def fit_least_squares(
-    problem: Problem, start: np.ndarray, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
+    problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
     """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown``: counts the steps."""
     vector, linear = start, problem.linearise(start)
@@ -139,14 +141,14 @@ class NormalEquations:
     With ``squares`` the terms of the scans are eliminated and only the parameters are left.
     """
 
-    matrix: np.ndarray
-    right: np.ndarray
+    matrix: Array
+    right: Array
     count: int
     term_shape: tuple[int, int]
     loss: float
 
     @classmethod
-    def at(cls, linear: Sequence[Linearised], terms: np.ndarray | None, rules: Rules) -> NormalEquations:
+    def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
         """The equations at linearised scans with the present ``terms`` (scans, k)."""
         count = len(linear[0].jacobian)
         if terms is None:
@@ -169,7 +171,7 @@ class NormalEquations:
             losses.append(magnitude.mean())
         return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
 
-    def solve(self, damping: float, room: Room | None) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, damping: float, room: Room | None) -> tuple[Array, Array]:
         """Changes of the parameters within their room, and of the terms (scans, k)."""
         count = self.count
         if room is not None:
@@ -188,7 +190,7 @@ class NormalEquations:
         terms = np.linalg.lstsq(self.matrix[count:, count:], rest, rcond=1e-14)[0]
         return step, terms[: scans * each].reshape(scans, each)
 
-    def _parameters_only(self) -> tuple[np.ndarray, np.ndarray]:
+    def _parameters_only(self) -> tuple[Array, Array]:
         """The equations with the terms of the scans eliminated."""
         count = self.count
         if len(self.matrix) == count:
@@ -199,32 +201,30 @@ class NormalEquations:
         return self.matrix[:count, :count] - across[:, :-1], self.right[:count] - across[:, -1]
 
 
-def promised_gain(matrix: np.ndarray, right: np.ndarray, step: np.ndarray) -> float:
+def promised_gain(matrix: Array, right: Array, step: Array) -> float:
     """What a step (p,) takes from the squares of normal equations (p, p), (p,) if the problem is linear."""
     return float(2 * right @ step - step @ matrix @ step)
 
 
-def with_residuals(linear: Sequence[Linearised], left: Sequence[np.ndarray]) -> list[Linearised]:
+def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[Linearised]:
     """All scans with these residuals (n,), µm, and the derivatives that they have."""
     return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
-def eliminated(part: Linearised, term_weight: float) -> tuple[np.ndarray, np.ndarray, float]:
+def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
     """Normal matrix, right side and weighted sum of squares of one scan, its own terms eliminated."""
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
 
 
-def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[np.ndarray, np.ndarray, float]:
+def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Array, Array, float]:
     """``eliminated``, summed over scans."""
     parts = [eliminated(part, term_weight) for part in linear]
     normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
     return normal, right, sum(p[2] for p in parts)
 
 
-def weighted_squares(
-    residuals: Sequence[np.ndarray], linear: Sequence[Linearised], term_weight: float
-) -> float:
+def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
     """Sum of squares of residuals (n,) of these scans, their own terms weighted down."""
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
@@ -232,9 +232,7 @@ def weighted_squares(
     )
 
 
-def solve_damped(
-    normal: np.ndarray, right: np.ndarray, damping: float, room: Room | None = None
-) -> np.ndarray:
+def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
     """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
 
     A step that is cut to its bounds afterwards would leave the other parameters where only the uncut
@@ -260,7 +258,7 @@ def solve_damped(
     return lsq_linear(factor.T, target, box, method="bvls").x / scale
 
 
-def orthonormal(columns: np.ndarray) -> np.ndarray:
+def orthonormal(columns: Array) -> Array:
     """Orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
     if not columns.shape[1]:
         return columns
@@ -270,19 +268,19 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     return scaled @ (directions[:, kept] / np.sqrt(sizes[kept]))
 
 
-def gram(columns: np.ndarray, basis: np.ndarray, weight_in_basis: float = 0.0) -> np.ndarray:
+def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
     """Inner products (m, m) of the columns (n, m), the part inside the basis (n, k) weighted down."""
     return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
 
 
-def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+def gram_inside(columns: Array, basis: Array) -> Array:
     """Inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
     inside = basis.T @ columns
     return inside.T @ inside
 
 
 def _total_loss(
-    residuals: Sequence[np.ndarray], linear: Sequence[Linearised], terms: np.ndarray | None, rules: Rules
+    residuals: Sequence[Array], linear: Sequence[Linearised], terms: Array | None, rules: Rules
 ) -> float:
     if terms is None:
         return weighted_squares(residuals, linear, rules.term_weight)
@@ -292,5 +290,5 @@ def _total_loss(
     return float(np.mean(losses))
 
 
-def _magnitude(residual_um: np.ndarray) -> np.ndarray:
+def _magnitude(residual_um: Array) -> Array:
     return np.sqrt(residual_um**2 + ABSOLUTE_WIDTH_UM**2)

@@ -1,7 +1,5 @@
 """Patches of a store for training loops of one's own: PyTorch's ``Dataset``, the lock box left out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, TypedDict

@@ -1,7 +1,5 @@
 """Networks of fixed features, fitted to single pixels: their features are made once for each scan."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Models that are linear in many features: ridge regression in closed form, one scan in memory at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

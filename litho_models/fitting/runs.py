@@ -1,7 +1,5 @@
 """Run folders: train a model on a store, resumable."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -28,7 +26,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.background import learn_background
-from litho_models.scoring.metrics import baseline_of
+from litho_models.scoring.printer_state import baseline_of
 from litho_models.simulator import Variant
 
 CHECKPOINT_FOLDER = "checkpoint"

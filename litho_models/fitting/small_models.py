@@ -1,7 +1,5 @@
 """Small models of the zoo fitted to printed scans: a window of each, derivatives in forward mode."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from litho_data.commands.progress import progress
+from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Room, Rules, fit_least_squares
@@ -61,22 +60,22 @@ class ModelProblem:
         self._samples = [_Sample(scan, number) for number, scan in enumerate(scans)]
         self._terms = terms
 
-    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+    def linearise(self, vector: Array) -> list[Linearised]:
         """All scans at these parameters."""
         _load(self._model, vector)
         return [sample.linearise(self._model, self._terms) for sample in self._samples]
 
-    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+    def residuals(self, vector: Array) -> list[Array]:
         """Measured minus predicted of all scans, µm."""
         _load(self._model, vector)
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
-    def room(self, vector: np.ndarray) -> Room | None:
+    def room(self, vector: Array) -> Room | None:
         """Within the ranges of the model; a linear one may go anywhere at once."""
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
-def parameter_room(model: nn.Module, vector: np.ndarray) -> Room:
+def parameter_room(model: nn.Module, vector: Array) -> Room:
     """Smallest and largest step (p,) of a model's trainable numbers: their ranges and ``STEP_LIMIT``."""
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)
@@ -104,7 +103,7 @@ class _Sample:
         used[::THINNING_PX, ::THINNING_PX] = True
         self._used = np.flatnonzero(used & cut(scan.valid, self._window) & np.isfinite(height))
         self._height = height.reshape(-1)[self._used].astype(np.float64)
-        self._expansion: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._expansion: tuple[Array, Array, Array] | None = None
 
     def linearise(self, model: Simulator, terms: Terms) -> Linearised:
         """The scan at the model as it is; a linear model is differentiated once."""
@@ -117,7 +116,7 @@ class _Sample:
         basis = term_maps(TermPixels(height, at=self._used), terms)
         return Linearised(self.residual(height), self._thinned(jacobian), basis)
 
-    def height_um(self, model: Simulator) -> np.ndarray:
+    def height_um(self, model: Simulator) -> Array:
         """Height of the window (y, x), µm, float64."""
         if model.is_linear and self._expansion is not None:
             here, value, jacobian = self._expansion
@@ -131,15 +130,15 @@ class _Sample:
             return model(stack([self._layout_um], [self._window]))[0, 0]
         return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
 
-    def residual(self, height_um: np.ndarray) -> np.ndarray:
+    def residual(self, height_um: Array) -> Array:
         """Measured minus predicted at the used pixels, µm."""
         return self._height - self._thinned(height_um)
 
-    def _thinned(self, fields: np.ndarray) -> np.ndarray:
+    def _thinned(self, fields: Array) -> Array:
         return fields.reshape(*fields.shape[:-2], -1)[..., self._used]
 
 
-def _jacobian(model: Simulator, sample: _Sample) -> np.ndarray:
+def _jacobian(model: Simulator, sample: _Sample) -> Array:
     """Derivatives (parameters, y, x) of the window, float64: in forward mode, all parameters in one pass."""
     prediction = _WindowPrediction(model, sample)
     named = {f"model.{name}": parameter for name, parameter in model.named_parameters()}
@@ -154,11 +153,11 @@ def _jacobian(model: Simulator, sample: _Sample) -> np.ndarray:
     return torch.func.jacfwd(predict)(here).movedim(-1, 0).detach().double().numpy()
 
 
-def _vector(model: Simulator) -> np.ndarray:
+def _vector(model: Simulator) -> Array:
     return torch.nn.utils.parameters_to_vector(list(model.parameters())).detach().numpy().copy()
 
 
-def _load(model: Simulator, vector: np.ndarray) -> None:
+def _load(model: Simulator, vector: Array) -> None:
     with torch.no_grad():
         torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), model.parameters())
 

@@ -1,7 +1,5 @@
 """The card of a frozen model: what it is for, what it was made from, and how well it does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -12,6 +10,7 @@ from litho_data.foundation.names import PlainName
 from litho_data.foundation.quantities import LevelHeightUm, Levels, PitchUm
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
+from litho_data.reports.page import filled
 from litho_data.store.schema import DatasetId
 from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
@@ -133,3 +132,15 @@ class ModelCard(RunFacts, Result):
                 hint=f"take {inside[0]}" if inside else "`litho-models freeze RUN --out FOLDER` writes one",
             )
         return super().read(folder)
+
+    @property
+    def page(self) -> str:
+        """Markdown with a Hugging Face front matter: what the model is, where to use it, what it scored."""
+        page = Path(__file__).with_name("readme.md.jinja")
+        return filled(page, card=self, bounds=bounds_text(self.at_bounds))
+
+
+def bounds_text(at_bounds: dict[str, float]) -> str:
+    """What it means that fitted values stand on their bounds."""
+    named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
+    return f"On a bound of its range, so that the fit may want more than the model allows: {named}."

@@ -23,7 +23,6 @@ from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
 from litho_models.frozen import hub, zoo
 from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
-from litho_models.frozen.readme import model_readme
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
@@ -49,7 +48,8 @@ def save_frozen(
         folder: where; an older model there is replaced as a whole.
         name: name in reports; the model's own by default.
         process_effects: effects of the printer that are part of the model, name to parameter values.
-        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …).
+        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); those that follow
+            from the model are found anew.
 
     Raises:
         InputError: weights that are not finite or not float32, or unknown card fields.
@@ -59,35 +59,27 @@ def save_frozen(
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
         # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
-        write_tensors(state, temporary / WEIGHTS_FILE)
+        (temporary / WEIGHTS_FILE).write_bytes(save(state))
         try:
-            card = ModelCard(
-                name=name or simulator.name,
-                model=simulator.name,
-                variant=config.variant,
-                hyper_parameters=config.model_dump(mode="json"),
-                parameters=simulator.parameter_count,
-                weights_sha256=file_sha256(temporary / WEIGHTS_FILE),
-                pitch_um=config.pitch_um,
-                level_height_um=config.level_height_um,
-                levels=config.levels,
-                calibrated_range_um=(0.0, config.full_height_um),
-                receptive_radius_um=None if process_effects else simulator.reach_um,
-                at_bounds=simulator.at_bounds,
-                process_effects=process_effects or {},
-                **{**run_facts(), **card_fields},
-            )
+            own = {
+                "name": name or simulator.name,
+                "model": simulator.name,
+                "hyper_parameters": config.model_dump(mode="json"),
+                "parameters": simulator.parameter_count,
+                "weights_sha256": file_sha256(temporary / WEIGHTS_FILE),
+                "calibrated_range_um": (0.0, config.full_height_um),
+                "receptive_radius_um": None if process_effects else simulator.reach_um,
+                "at_bounds": simulator.at_bounds,
+                "process_effects": process_effects or {},
+            }
+            geometry = config.model_dump(include={"variant", "pitch_um", "level_height_um", "levels"})
+            card = ModelCard(**{**run_facts(), **card_fields, **geometry, **own})
         except ValidationError as error:
             raise InputError("model card", got=first_error(error), wanted=ModelCard.SCHEMA) from error
         _check_effects(card)
         card.write(temporary)
-        (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
+        (temporary / README_FILE).write_text(card.page, encoding="utf-8")
     return Path(folder)
-
-
-def write_tensors(tensors: dict[str, Tensor], file: Path) -> None:
-    """A file of safetensors; an OSError, which theirs is not, where it cannot be written."""
-    file.write_bytes(save(tensors))
 
 
 def load_frozen(

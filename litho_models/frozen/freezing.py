@@ -1,7 +1,5 @@
 """The process model of a run folder, written as a frozen model on its own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
@@ -18,27 +16,6 @@ SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
     f"Stated errors are those with {SCAN_AXIS}, which belongs to measured maps and is left out here."
 )
-_CARRIED_FIELDS = {
-    "training_level_share",
-    "training_step_share",
-    "dataset",
-    "training",
-    "command",
-    "commit",
-    "dirty",
-    "split",
-    "nuisance",
-    "background",
-    "metrics",
-    "noise_floor",
-    "baseline",
-    "declared_processes",
-    "confusable_sets",
-    "unexplained_fraction",
-    "fabrication_batch",
-    "optimiser_gap",
-    "limitations",
-}
 
 
 def freeze(
@@ -87,7 +64,7 @@ def freeze(
             got=f"{card.name}, which was frozen without it",
             wanted="the folder of `train` or `close-loop`",
         )
-    kept = card.model_dump(mode="json", by_alias=True, include=_CARRIED_FIELDS)
+    kept = card.model_dump(mode="json", by_alias=True, exclude={"name", "process_effects", "versions"})
     kept["undetermined_effects"], kept["measurement_effects"] = undetermined, sides["microscope"]
     kept["attributed"] = {**card.attributed, **(attribute or {})}
     if not taken and printer is not simulator:

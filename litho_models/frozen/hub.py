@@ -1,7 +1,5 @@
 """Frozen models on the Hugging Face Hub: a repository of three files, fetched or shared."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

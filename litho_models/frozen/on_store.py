@@ -1,7 +1,5 @@
 """A frozen model on stored data: a file of levels, or the scans of a store and which of them it has seen."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 ``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
 """
 
-from __future__ import annotations
-
 import builtins
 import json
 from collections.abc import Iterable

@@ -4,8 +4,6 @@ Along each axis blocks of pixels are multiplied by one band of the kernel's weig
 thousand pixels this is faster than a Fourier transform, and no period or padding rule leaks in.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, Literal

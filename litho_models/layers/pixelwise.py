@@ -1,7 +1,5 @@
 """Functions that see each pixel alone, block after block of pixels, so that hidden values stay few."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """In which precision networks multiply, and whether the processor at hand gains by less of it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ raw number any more, and a fit that has run there could not come back. So fits k
 ``FLAT_FROM``, and a value whose raw number is that far out stands on its bound.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -55,15 +55,16 @@ def choose_base(
     model = _built(base, scans[0])
     if is_small(model):
         return Base(base, model, {})
-    settings: dict[str, Any] = {"seed": study.seed} if steps is None else {"seed": study.seed, "steps": steps}
-    trainer = partial(_trained, base, TrainingConfig.of_recipe("fast", base, **settings), cache)
+    given: dict[str, Any] = {} if steps is None else {"steps": steps}
+    recipe = TrainingConfig.of_recipe("fast", base, seed=study.seed, **given)
+    trainer = partial(_trained, base, recipe, cache)
     return Base(base, train_folds(scans, study.fold_of, trainer, study.workers), {})
 
 
 def _best(scans: Sequence[PrintedScan], study: Study) -> Base:
+    built = {name: _built(name, scans[0]) for name in _COMPETING}
     prepared = prepare_scans(scans)
     plain = replace(study, scans=prepared)
-    built = {name: _built(name, scans[0]) for name in _COMPETING}
     errors = {}
     for name, one in built.items():
         study.report(f"trying {name} as the base")

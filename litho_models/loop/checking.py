@@ -18,8 +18,8 @@ from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, Study, held_out_maps, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, search
+from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
@@ -80,8 +80,8 @@ class Check:
         if share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
             return Checked(cause, share, f"only resembles the cause: {taken}")
-        if law := self._law_instead(without):
-            return Checked(cause, share, f"a law does better in its place: {law}")
+        if laws := self._laws_instead(cause.name, without):
+            return Checked(cause, share, f"short laws do better in its place: {', '.join(laws)}")
         return Checked(cause, share, "")
 
     def _larger(self, cause: Cause, without: State) -> str:
@@ -100,11 +100,12 @@ class Check:
                     return other.name
         return ""
 
-    def _law_instead(self, without: State) -> str:
-        """A law that does better in a cause's place; empty if none."""
-        law = search(without, self.study, self.laws, 1, self.secants)
-        better = law.causes and judge(self.state.freed_nm2, law.state.freed_nm2, self.study).passed()
-        return law.names[0] if better else ""
+    def _laws_instead(self, name: str, without: State) -> list[str]:
+        """Laws, two at most and with no more numbers, that do better in a cause's place; empty if none."""
+        numbers = sum(slot.effect == name for slot in self.state.twin.slots)
+        laws = search(without, self.study, self.laws, min(numbers, 2), self.secants)
+        better = laws.causes and judge(self.state.freed_nm2, laws.state.freed_nm2, self.study).passed()
+        return laws.names if better else []
 
 
 def reshaped_gain(without: State, state: State, study: Study) -> float:

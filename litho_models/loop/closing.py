@@ -21,11 +21,13 @@ from litho_models.effects.laws import LAWS, TABLES
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.checking import Check, Checked
 from litho_models.loop.fits import RULES, State, Study, TwinProblem, fit_state, held_out_maps
+from litho_models.loop.judging import judge
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans, prepared_among
-from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable
+from litho_models.loop.trials import Secants
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
@@ -37,13 +39,13 @@ class Chosen:
     Attributes:
         named: among causes; ``checked``: they and those that failed, with their checks.
         lawful: among short laws.
-        described: tables over a covariate, which say where the rest lies and enter no model.
+        described: tables over a covariate, which say where the rest lies; the model has them last.
     """
 
     named: Found
     checked: list[Checked]
     lawful: Found
-    described: list[Cause]
+    described: Found
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ class Closed:
 
     @property
     def final(self) -> State:
-        """The corrected model: causes and laws."""
-        return self.chosen.lawful.state
+        """The corrected model: causes, laws, and tables where neither holds."""
+        return self.chosen.described.state
 
     @property
     def causes(self) -> list[Cause]:
@@ -83,7 +85,7 @@ class Closed:
     @property
     def found(self) -> list[Cause]:
         """All that is reported."""
-        return [*self.traced, *self.chosen.described]
+        return [*self.traced, *self.chosen.described.causes]
 
 
 def close(
@@ -119,6 +121,7 @@ def close(
     stages: dict[State, str] = {start: "base"}
     stages.setdefault(chosen.named.state, "causes")
     stages.setdefault(chosen.lawful.state, "laws")
+    stages.setdefault(chosen.described.state, "tables")
     return Closed(
         study=at_work,
         original=original,
@@ -151,7 +154,7 @@ def _chosen(
         study.report("describing what is left")
         described = describe(lawful.state, study, tables, 2, secants)
         if not named.causes:
-            return Chosen(named, failed, lawful, described)
+            return Chosen(named, failed, lawful, _in_model(lawful.state, described, study))
         in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
         left_nm2 = learner().rest(held_out_maps(in_place.per_fold, study, study.scans)).mean_nm2
         check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
@@ -163,13 +166,26 @@ def _chosen(
             key=lambda one: (not one.corrects, one.cause.judgement.gain_nm2),
         )
         if not wrong:
-            return Chosen(named, [*checked, *failed], lawful, described)
+            return Chosen(named, [*checked, *failed], lawful, _in_model(lawful.state, described, study))
         name, reason = wrong[0].cause.name, wrong[0].reason
         study.report(f"{name}: {reason}")
         failed.append(wrong[0])
         named.refused[name] = reason
         named.causes = [cause for cause in named.causes if cause.name != name]
         named.state = named.state.without(name, study) if named.causes else start
+
+
+def _in_model(state: State, described: Sequence[Cause], study: Study) -> Found:
+    """The model with every table that is confirmed there too, fitted beside all the rest."""
+    found = Found(state)
+    for table in described:
+        twin = found.state.twin.with_effect(table.name, table.by, table.values)
+        fitted = fit_state(twin, study, from_here=True)
+        judgement = judge(found.state.freed_nm2, fitted.freed_nm2, study)
+        if judgement.passed(grouped=table.by != ALL):
+            found.state = fitted
+            found.causes.append(replace(table, judgement=judgement))
+    return found
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float, study: Study) -> State:

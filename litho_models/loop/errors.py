@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -13,7 +13,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed, Fit, fit_with_measurement
-from litho_models.loop.fits import State, Study, fit_state, held_out_maps
+from litho_models.loop.fits import State, fit_state, held_out_maps
 from litho_models.loop.judging import judge
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
@@ -69,34 +69,41 @@ class HeldOut:
     """The models that a loop has found, each fitted with its measurement to other scans than are scored.
 
     Args:
-        closed: what was found; ``settings``: folds, seed, workers, report.
+        closed: what was found.
     """
 
-    def __init__(self, closed: Closed, settings: Study):
-        self.closed, self.settings = closed, settings
+    def __init__(self, closed: Closed):
+        self.closed, self.study = closed, closed.study
         self.scans = [one.stored for one in closed.original]
-        # Base and corrected model, and the one between them if there are causes and laws.
-        self.ends: dict[Stage, State] = {"base": closed.base, "all": closed.final}
-        causes: dict[Stage, State] = {"causes": closed.chosen.named.state}
-        between = causes if closed.causes and closed.chosen.lawful.causes else {}
-        self.stages = {"base": closed.base, **between, **self.ends}
         self._by_fold = cache(self._without_folds)
+
+    @property
+    def ends(self) -> dict[Stage, State]:
+        """Base and corrected model."""
+        return {"base": self.closed.base, "all": self.closed.final}
+
+    @property
+    def stages(self) -> dict[Stage, State]:
+        """The same, and the model with the causes alone between them if it is neither."""
+        causes = self.closed.chosen.named.state
+        between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
+        return {"base": self.closed.base, **between, **self.ends}
 
     def errors(self) -> list[ErrorRow]:
         """Of all models, scans predicted without their fold; of first and last also without their print."""
         plain = self.closed.plain
         numbers = len(plain.twin.vector)
-        maps = held_out_maps(plain.per_fold, self.settings, self.closed.original)
+        maps = held_out_maps(plain.per_fold, self.study, self.closed.original)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
         # A smooth background has five numbers.
         rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
         for name, state in self.stages.items():
-            self.settings.report("scoring the base" if name == "base" else f"scoring {name}")
+            self.study.report("scoring the base" if name == "base" else f"scoring {name}")
             rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
         if 1 < len(set(prints)) < len(prints) and is_refitted(self.closed.base.twin.base):
             for name, state in self.ends.items():
-                self.settings.report(f"leaving out whole prints: {name}")
+                self.study.report(f"leaving out whole prints: {name}")
                 starts = dict.fromkeys(sorted(set(prints)), state.twin)
                 rows += self._rows(*self._without_parts(starts, prints), name, held_out="prints")
         return rows
@@ -105,7 +112,7 @@ class HeldOut:
         """Numbers of base and corrected model, fitted to all scans that took part; maps of these others."""
         prepared, found = prepared_among(scans, self.closed.original), []
         for name, state in self.ends.items():
-            fit = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)
+            fit = fit_with_measurement(state.twin, self.closed.original, self.study.seed)
             found.append((name, fit.numbers, fit.expected_um(prepared)))
         return found
 
@@ -126,8 +133,8 @@ class HeldOut:
         model, found = self.closed.final, {}
         whole_nm = mae_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
-            self.settings.report(f"leaving out {name}")
-            found[name] = mae_nm(model.without(name, self.closed.study)) - whole_nm
+            self.study.report(f"leaving out {name}")
+            found[name] = mae_nm(model.without(name, self.study)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -145,10 +152,10 @@ class HeldOut:
 
     def survives_on(self, others: Mapping[str, nn.Module]) -> dict[str, list[str]]:
         """For each cause and law, the other bases on which it is confirmed too, all others in place."""
-        final, study = self.closed.final.twin, self.closed.study
+        final, study = self.closed.final.twin, self.study
         found: dict[str, list[str]] = {name: [] for name in final.names}
         for base_name, base in others.items() if found else ():
-            self.settings.report(f"trying what was found on {base_name}")
+            self.study.report(f"trying what was found on {base_name}")
             bare = fit_state(Twin.bare(base, study.scans[0]), study)
             full = fit_state(final.over(bare.twin.placed().base, study.scans[0]), study)
             for name, by in final.by.items():
@@ -159,10 +166,10 @@ class HeldOut:
 
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
         terms = {"measurement": "shared", "held_out": "scans", **terms}
-        return error_rows(self.scans, maps, numbers, self.settings.seed, model=model, **terms)
+        return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
 
     def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
-        fold_of = self.settings.fold_of.tolist()
+        fold_of = self.study.fold_of.tolist()
         return self._without_parts(dict(enumerate(state.per_fold)), fold_of, refit)
 
     def _without_parts(
@@ -176,15 +183,15 @@ class HeldOut:
         original, jobs = self.closed.original, []
         for part, twin in starts.items():
             rest = [scan for scan, own in zip(original, part_of, strict=True) if own != part]
-            jobs.append((part, twin, rest, self.settings.seed, refit))
-        done = run_jobs(_fit_part, jobs, self.settings.workers, name=lambda job: f"part {job[0]}")
+            jobs.append((part, twin, rest, self.study.seed, refit))
+        done = run_jobs(_fit_part, jobs, self.study.workers, name=lambda job: f"part {job[0]}")
         fits = {job[0]: fit for job, fit in done}
         maps = [fits[part].expected_um([scan])[0] for scan, part in zip(original, part_of, strict=True)]
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, maps: Maps) -> Maps:
         """The maps with the smooth background of the training scans: the published protocol."""
-        found, fold_of = list(maps), self.settings.fold_of
+        found, fold_of = list(maps), self.study.fold_of
         for fold, twin in enumerate(self.closed.plain.per_fold):
             placed, own = twin.placed(), np.flatnonzero(fold_of != fold).tolist()
             learned = learn_background(
@@ -197,3 +204,23 @@ class HeldOut:
 
 def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, bool]) -> Fit:
     return fit_with_measurement(*job[1:])
+
+
+def errors_of_others(
+    found: Iterable[tuple[HeldOut, Sequence[PrintedScan]]],
+    scans: Sequence[PrintedScan],
+    held_out: str,
+    seed: int,
+) -> list[ErrorRow]:
+    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
+    maps: dict[Stage, dict[str, np.ndarray]] = {}
+    numbers: dict[Stage, tuple[int, int]] = {}
+    for models, out in found:
+        for stage, count, own in models.of_others(out):
+            maps.setdefault(stage, {}).update(zip([scan.id for scan in out], own, strict=True))
+            numbers[stage] = max(count, numbers.get(stage, count))
+    rows = []
+    for stage, known in maps.items():
+        terms = {"model": stage, "measurement": "shared", "held_out": held_out}
+        rows += error_rows(scans, [known[scan.id] for scan in scans], numbers[stage], seed, **terms)
+    return rows

@@ -19,7 +19,6 @@ from litho_models.fitting.least_squares import (
     Rules,
     eliminated_sum,
     fit_least_squares,
-    orthonormal,
     promised_gain,
     solve_damped,
     with_residuals,
@@ -141,8 +140,7 @@ class TwinProblem:
             if slot is not None and get_effect(slot.effect).acts_on == "height":
                 known = base
             rows[at] = (window.at_sample(other.height(window, base_um=known)) - value) / steps[at]
-        basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
-        return Linearised(window.height - value, rows, basis)
+        return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all windows, µm."""
@@ -206,7 +204,7 @@ def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
     """Columns (n, m) at the sampled pixels, without what a single scan may add to a prediction (y, x), µm."""
-    basis = orthonormal(window.terms_at_sample(prediction_um, terms).T)
+    basis = window.free_basis(prediction_um, terms)
     return columns - basis @ (basis.T @ columns)
 
 

@@ -44,16 +44,13 @@ def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
     """Train once without each fold and once on all development scans."""
-    folds = range(int(fold_of.max()) + 1)
+    fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
     # No scan has the number of the last one.
-    jobs = [
-        (fold, trainer, [scan for scan, own in zip(scans, fold_of, strict=True) if own != fold])
-        for fold in (*folds, len(folds))
-    ]
+    last = max(fold.values()) + 1
+    jobs = [(out, trainer, [one for one in scans if fold[one.id] != out]) for out in range(last + 1)]
     done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")
-    trained = {fold: model for (fold, *_), model in progress(done, "training the base model", len(jobs))}
-    assigned = {scan.id: int(fold) for scan, fold in zip(scans, fold_of, strict=True)}
-    return FoldedBase([trained[fold] for fold in folds], assigned, trained[len(folds)])
+    trained = {out: model for (out, *_), model in progress(done, "training the base model", len(jobs))}
+    return FoldedBase([trained[out] for out in range(last)], fold, trained[last])
 
 
 def _train(job: tuple[int, Trainer, Sequence[PrintedScan]]) -> nn.Module:

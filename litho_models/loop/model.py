@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
@@ -218,7 +217,9 @@ class Twin:
         facts = [slot.facts for slot in self.slots]
         nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
         known = [
-            (one.lower, one.upper, abs(one.typical - null)) for one, null in zip(facts, nulls, strict=True)
+            # What is zero as a rule, as an angle, has a tenth of its range for a usual size.
+            (one.lower, one.upper, abs(one.typical - null) or 0.1 * (one.upper - one.lower))
+            for one, null in zip(facts, nulls, strict=True)
         ]
         return np.array(known).reshape(-1, 3).T
 
@@ -231,18 +232,13 @@ class Twin:
         """Fitted values of base and effects that stand on a bound of their range, and that bound."""
         placed = self.placed().base
         found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
-        for slot, bound in self._on_bounds():
-            found[f"{slot.effect}: {slot.parameter}"] = bound
-        return found
+        return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
         """Amplitudes of an effect that some group has at a limit of their range other than the null."""
-        found = [
-            slot.parameter
-            for slot, bound in self._on_bounds()
-            if slot.effect == name and slot.facts.kind == "amplitude" and bound != slot.facts.null
-        ]
-        return [*dict.fromkeys(found)]
+        own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
+        beyond = (slot for slot, at in own if slot.facts.kind == "amplitude" and at != slot.facts.null)
+        return [*dict.fromkeys(slot.parameter for slot in beyond)]
 
     def _on_bounds(self) -> list[tuple[Slot, float]]:
         return [
@@ -264,12 +260,16 @@ class Placed:
             values = twin.vector[at : at + parameter.numel()]
             parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
             at += parameter.numel()
-        self._known = cache(self.of_labels)
+        self._chains: dict[tuple[tuple[str, str], ...], EffectChain] = {}
 
     def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
         """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
         labels = tuple(self.twin.labels(scan).items())
-        return self._known(labels) if extra is None else self.of_labels(labels, extra)
+        if extra is not None:
+            return self.of_labels(labels, extra)
+        if labels not in self._chains:
+            self._chains[labels] = self.of_labels(labels)
+        return self._chains[labels]
 
     def of_labels(self, labels: tuple[tuple[str, str], ...] = (), extra: Values | None = None) -> EffectChain:
         """The chain for scans with these labels, by grouping; without any it has the mean strengths."""

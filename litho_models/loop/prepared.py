@@ -13,6 +13,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
+from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
@@ -61,6 +62,10 @@ class PreparedScan:
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
         """Smooth scan terms at the thinned pixels, (k, n)."""
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
+
+    def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
+        """Orthonormal basis (n, k) of what the scan may add to a prediction (y, x), µm, by itself."""
+        return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:

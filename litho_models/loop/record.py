@@ -37,7 +37,7 @@ class ErrorRow(Record):
     """Error of one model on scans held out from it.
 
     Attributes:
-        model: the base, with its causes, with causes and laws (``all``, the corrected model).
+        model: the base, with its causes, with all that was found (``all``, the corrected model).
         measurement: what is added to the print: nothing, the smooth background that training scans share (the
             published protocol), or the whole measurement model.
         policy: terms of each scan, ``k`` of them, fitted on pixels that are not scored.

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from litho_data.reports.page import Page, sentences
-from litho_data.reports.pictures import new_figure
-from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect, ScanFinding
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
+from litho_models.loop.record import CloseLoop, FoundEffect
 
 Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 
@@ -28,10 +24,12 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         words=Path(__file__).with_name("words.toml"),
     )
     page.verdict(said("verdict", result))
-    page.tiles(
-        [(f"{row.mae_nm:.2f} nm", f"{said('stage', row.model)}, k = {row.k:g}") for row in _headline(result)]
-    )
-    page.figure(_bars(result), "Error on held-out scans, zero of each scan free. Grey: the base.")
+    shown = [
+        result.error("base", measurement="published"),
+        *(row for row in result.errors if row.is_headline),
+    ]
+    page.tiles([(f"{row.mae_nm:.2f} nm", said("stage", row)) for row in shown if row])
+    page.paragraph("Mean absolute error on held-out scans; the zero of each scan is free.")
     if result.effects:
         page.heading("What was found")
         page.points([said("effect", one) for one in result.effects])
@@ -50,7 +48,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.heading("What new prints decide")
         page.points([said("decision", one) for one in result.decisions])
     page.heading("Where the residual lies")
-    page.figure(_residuals(maps), "Measured minus expected, before (top) and after (below).")
+    _residuals(page, maps)
     page.table(
         result.explained,
         "What a ridge over features of layout and place still explains, out of fold.",
@@ -66,7 +64,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     page.paragraph(said("measurement", result.measurement))
     page.heading("What single scans add", folded=True)
     page.table(
-        [one.model_dump() | {"spread": _spread(one)} for one in result.single_scans],
+        [one.model_dump() | {"spread": said("spread", one)} for one in result.single_scans],
         "Each scan its own; no model has it. Spread: standard deviation over scans.",
         "single_scans.csv",
     )
@@ -81,46 +79,20 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
 
 
 def said(about: str, one: object) -> str:
-    """In words: the ``verdict`` of a result, an ``effect``, a ``decision``, a ``measurement`` model."""
+    """A ``verdict`` (of a result), ``effect``, ``decision``, ``measurement`` or other macro, in words."""
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 
-def _headline(result: CloseLoop) -> list[ErrorRow]:
-    """Errors of the stages, k = 1, with the shared measurement."""
-    return [row for row in result.errors if row.is_headline]
-
-
-def _bars(result: CloseLoop) -> Figure:
-    rows = [row for row in (result.error("base", measurement="published"), *_headline(result)) if row]
-    labels = ["base, published protocol", *(said("stage", row.model) for row in rows[1:])]
-    figure = new_figure(9, 0.45 * len(rows) + 1.1)
-    axes = figure.subplots()
-    at = np.arange(len(rows))[::-1]
-    colours = ["#9aa5b1" if row.model == "base" else "#2f7fd0" for row in rows]
-    drawn = axes.barh(at, [row.mae_nm for row in rows], color=colours, height=0.66)
-    axes.bar_label(drawn, fmt="%.2f", padding=4)
-    axes.set_yticks(at, labels)
-    axes.margins(x=0.15)
-    axes.set_xlabel("mean absolute error on held-out scans (nm)")
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def _residuals(maps: Maps) -> Figure:
-    """Maps of the scans with the largest, a middling and the smallest error of the base."""
-    size = [float(np.nanmean(before**2)) for _, before, _ in maps]
-    order = np.argsort(size)[::-1][[0, (len(maps) - 1) // 2, -1]].tolist()
-    shown = [maps[at] for at in dict.fromkeys(order)]
-    limit = 2.5 * float(np.sqrt(np.mean(size)))
-    figure = new_figure(4 * len(shown) + 0.8, 8)
-    axes = figure.subplots(2, len(shown), squeeze=False)
-    for column, (name, *pair) in zip(axes.T, shown, strict=True):
-        for panel, when, own in zip(column, ("before", "after"), pair, strict=True):
-            panel.imshow(own, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-            panel.set_title(f"{name} {when}: {np.nanmean(np.abs(own)):.1f} nm", fontsize=10)
-            panel.set_axis_off()
-    figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - expected (nm)", shrink=0.6)
-    return figure
+def _residuals(page: Page, maps: Maps) -> None:
+    limit_nm = 2.5 * float(np.sqrt(np.mean([np.nanmean(before**2) for _, before, _ in maps])))
+    bar = colour_bar_png("RdBu_r")
+    titles = [(f"{when}, {-limit_nm:.0f} … {limit_nm:.0f} nm", bar) for when in ("before", "after")]
+    rows = []
+    for name, *pair in maps:
+        errors = " → ".join(f"{np.nanmean(np.abs(own)):.1f}" for own in pair)
+        shown = [coloured_png(thumbnail(own), "RdBu_r", -limit_nm, limit_nm) for own in pair]
+        rows.append((f"{name}: {errors} nm", shown))
+    page.gallery(titles, rows, "Measured minus expected, and the mean absolute error of each map.")
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
@@ -131,7 +103,3 @@ def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
             facts = {"group": own.label, "value": own.value, "unit": own.unit, "from": low, "to": high}
             rows.append({"effect": one.name, "parameter": name, **facts})
     return rows
-
-
-def _spread(one: ScanFinding) -> str:
-    return ", ".join(f"{name} {own.value:.3g} {own.unit}" for name, own in one.spread.items())

@@ -143,7 +143,7 @@ def _found(
 
 
 def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for; of a table alone."""
+    """Numbers of an effect with intervals from what each print (or scan) asks for."""
     from scipy.stats import t
 
     facts, found = get_effect(cause.name).parameters, dict[str, list[Strength]]()
@@ -153,9 +153,6 @@ def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
         own = Strength(label=label, value=value, unit=facts[parameter].unit, ci95=ci95)
         found.setdefault(parameter, []).append(own)
 
-    for label, values in cause.values.items():
-        for parameter, value in values.items():
-            add(parameter, label, value)
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd

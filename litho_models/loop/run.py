@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -19,12 +19,12 @@ from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.loop.bases import AUTO, choose_base
 from litho_models.loop.closing import Closed, close, fit_with_measurement
-from litho_models.loop.errors import HeldOut, error_rows
+from litho_models.loop.errors import HeldOut, errors_of_others
 from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
 from litho_models.loop.model import is_refitted
 from litho_models.loop.planting import parse_planted, plant
-from litho_models.loop.record import CloseLoop, ErrorRow, Stage
+from litho_models.loop.record import CloseLoop, ErrorRow
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
@@ -95,7 +95,7 @@ def close_loop(
                 f"--nested with {base}", got="a model that is not fitted here", wanted="a small model's name"
             )
         closed = close(development, study.fold_of, chosen.model, study)
-        held_out = HeldOut(closed, study)
+        held_out = HeldOut(closed)
         errors = held_out.errors()
         often: dict[str, int] = {}
         left_out_nm, survives_on = held_out.left_out_nm(), held_out.survives_on(chosen.others)
@@ -104,15 +104,16 @@ def close_loop(
             rows, often = _nested(development, chosen.model, study, nested)
             errors += rows
         if open_lock_box and locked:
-            errors += _judged([(held_out, locked)], locked, "locked", seed)
+            errors += errors_of_others([(held_out, locked)], locked, "locked", seed)
 
         report("looking at what single scans add")
-        maps = held_out.maps_um(closed.final)
+        maps, residuals = held_out.maps_um(closed.final), held_out.residuals()
+        terms = SingleScans(study, closed.original, maps).findings()
         seen = marks(closed.original, maps, _rounding_um(opened, development))
         result = record(
             closed,
             errors,
-            single_scans=with_marks(SingleScans(study, closed.original, maps).findings(), seen),
+            single_scans=with_marks(terms, seen),
             left_out_nm=left_out_nm,
             survives_on=survives_on,
             run=run_info([seed], len(development), dropped),
@@ -127,7 +128,7 @@ def close_loop(
         result, beside = further(closed, result) if further else (result, ())
         for written in (result, *beside):
             written.write(folder)
-        write_report(result, held_out.residuals(), folder)
+        write_report(result, residuals, folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
         save_laws(result, folder)
     return result
@@ -186,29 +187,9 @@ def _nested(
             study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)
-            yield HeldOut(closed, study), [scan for scan in scans if scan.id in out]
+            yield HeldOut(closed), [scan for scan in scans if scan.id in out]
 
-    return _judged(anew(), scans, f"nested {nested}", study.seed), dict(often)
-
-
-def _judged(
-    found: Iterable[tuple[HeldOut, Sequence[PrintedScan]]],
-    scans: Sequence[PrintedScan],
-    held_out: str,
-    seed: int,
-) -> list[ErrorRow]:
-    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
-    maps: dict[Stage, dict[str, np.ndarray]] = {}
-    numbers: dict[Stage, tuple[int, int]] = {}
-    for models, out in found:
-        for stage, count, own in models.of_others(out):
-            maps.setdefault(stage, {}).update(zip([scan.id for scan in out], own, strict=True))
-            numbers[stage] = max(count, numbers.get(stage, count))
-    rows = []
-    for stage, known in maps.items():
-        terms = {"model": stage, "measurement": "shared", "held_out": held_out}
-        rows += error_rows(scans, [known[scan.id] for scan in scans], numbers[stage], seed, **terms)
-    return rows
+    return errors_of_others(anew(), scans, f"nested {nested}", study.seed), dict(often)
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:

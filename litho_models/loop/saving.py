@@ -40,8 +40,9 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     by_side: dict[str, Values] = {f"{side}_effects": {} for side in (*sides, "undetermined")}
     for one in result.effects:
         if one.name in values:
-            side = one.role if one.role in sides else "undetermined"
-            by_side[f"{side}_effects"][one.name] = values[one.name]
+            by_side[f"{one.role if one.role in sides else 'undetermined'}_effects"][one.name] = values[
+                one.name
+            ]
     error = result.error("all")
     assert error is not None
     save_frozen(

@@ -16,15 +16,10 @@ from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart
-from litho_models.loop.screening import (
-    SMALLEST_RETAINED,
-    Screened,
-    Screening,
-    Secants,
-    gains_by,
-    permutation_p,
-)
-from litho_models.scan_terms.grouped import ALL, Labels
+from litho_models.loop.regrouping import best_grouping, regrouped
+from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening
+from litho_models.loop.trials import Secants
+from litho_models.scan_terms.grouped import ALL
 
 # Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
 WORTH_FITTING = 0.3
@@ -41,7 +36,7 @@ class Cause:
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        values: of its parameters by label, where no model has it.
+        values: of its parameters by label, from which a table is fitted.
     """
 
     name: str
@@ -96,16 +91,18 @@ def search(
 def describe(
     state: State, study: Study, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Tables that stand out beside a model, each as a linear fit beside it alone; they enter no model."""
+    """Tables that stand out beside a model, each as a linear fit beside it alone."""
     screening, found = Screening(state, study, tables, secants), []
     for one in _standing(screening, Found(state))[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
         if judgement.passed(grouped=one.by != ALL):
-            group_p = None if one.by == ALL else screening.permutation_p(one)
-            found.append(
-                Cause(one.name, one.by, (), judgement, screening.family_p(one), group_p, one.start())
-            )
+            found.append(replace(_cause(one, (), judgement, screening), values=one.start()))
     return found
+
+
+def _cause(one: Screened, alike: tuple[str, ...], judgement: Judgement, screening: Screening) -> Cause:
+    group_p = None if one.by == ALL else screening.permutation_p(one)
+    return Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p)
 
 
 def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: Secants | None) -> bool:
@@ -127,62 +124,30 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: 
             if refused := judgement.reason(grouped=one.by != ALL):
                 found.refused[one.name] = refused
                 continue
-            group_p = None if one.by == ALL else screening.permutation_p(one)
             alike = _alike(one, fitted, found.state, screening, study)
-            found.causes.append(Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p))
+            found.causes.append(_cause(one, alike, judgement, screening))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
             if one.by == ALL:
-                _by_group(found, study)
+                _regroup(found, study)
             gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
 
 
-def _by_group(found: Found, study: Study) -> None:
-    """Let the strength of the cause that was just added differ by group, if that is confirmed.
-
-    The derivative where the effect stands says more than the one at its null, by which it was screened.
-    """
-    cause, twin = found.causes[-1], found.state.twin
-    slots = {
-        at: slot
-        for at, slot in enumerate(twin.slots, twin.own)
-        if slot.effect == cause.name and slot.facts.kind == "amplitude"
-    }
-    freed = Screening(found.state, study, (), kept=slots).freed
-
-    def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return gains_by(freed, study.fold_of, [1 + at for at in slots], labels)
-
-    groups = {by: labels for by, labels in study.groups.items() if by != ALL}
-    gains = {by: float(gained(labels)[0].mean()) for by, labels in groups.items()}
-    by = _best_grouping(gains, {by: len(set(labels)) for by, labels in groups.items()})
-    if by is None:
+def _regroup(found: Found, study: Study) -> None:
+    """Let the strength of the cause that was just added differ by group, if that is confirmed."""
+    cause = found.causes[-1]
+    other = regrouped(found.state, cause.name, study)
+    if other is None:
         return
-    p = permutation_p(study, groups[by], gains[by], lambda labels: gained(labels)[0])
-    if p > EXCHANGED_P:
-        return
-    known = twin.values({})[cause.name]
-    starts = {label: dict(known) for label in groups[by]}
-    for label, steps in gained(groups[by])[1].items():
-        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
-            value = known[slot.parameter] + step
-            starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
-    other = twin.without(cause.name).with_effect(cause.name, by, starts)
-    state = fit_state(other, study, from_here=True)
+    by, p, twin = other
+    state = fit_state(twin, study, from_here=True)
     if judge(found.state.freed_nm2, state.freed_nm2, study).p <= GROUPED_P:
         study.report(f"{cause.name} differs by {by}")
         found.causes[-1] = replace(cause, by=by, group_p=p)
         found.state = state
-
-
-def _best_grouping(gains: Mapping[str, float], numbers: Mapping[str, int]) -> str | None:
-    """The grouping that gains most; of those that do nearly as well the one with the fewest numbers."""
-    most = max(gains.values(), default=0.0)
-    close = [by for by, gain in gains.items() if gain >= 0.95 * most > 0]
-    return min(close, key=lambda by: (numbers[by], -gains[by]), default=None)
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
@@ -246,7 +211,7 @@ def _grouped(
     """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
     least = max(common.gain_nm2, 0.0) + 0.01 * mse_nm2
     better = {one.by: one for one in own if one.by != ALL and one.allowed and one.gain_nm2 > least}
-    by = _best_grouping(
+    by = best_grouping(
         {by: one.gain_nm2 for by, one in better.items()}, {by: one.numbers for by, one in better.items()}
     )
     return None if by is None or screening.permutation_p(better[by]) > EXCHANGED_P else better[by]

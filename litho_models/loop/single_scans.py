@@ -141,13 +141,13 @@ class SingleScans:
             )
             judgement = _as_variance(before, after[name], self.study)
             excess_p = one_sided_flip_p(gains[name] - columns)
-            reasons = [judgement.reason()] if judgement.reason() else []
-            if excess_p > CONFIRM_P:
-                reasons.append(f"rows gain no more than columns (p = {excess_p:.3f})")
+            excess = "" if excess_p <= CONFIRM_P else f"rows gain no more than columns (p = {excess_p:.3f})"
+            follows = ""
             if beaten:
-                reasons.append(f"the lines follow {_frame(other)} more closely: {other}")
+                follows = f"the lines follow {_frame(other)} more closely: {other}"
             elif at and not better:
-                reasons.append(f"cannot be told from {other}: no scan is turned enough against its layout")
+                follows = f"cannot be told from {other}: no scan is turned enough against its layout"
+            reasons = [*filter(None, (judgement.reason(), excess, follows))]
             deviation = np.sqrt(np.maximum(gains[name], 0).mean()) / NM_PER_UM
             taken = f"{gains[name].mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
             found.append(

@@ -1,7 +1,5 @@
 """All models by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

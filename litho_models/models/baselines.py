@@ -1,7 +1,5 @@
 """Baselines, from the layout itself to linear features in closed form: what every model must beat."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

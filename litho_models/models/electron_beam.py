@@ -1,7 +1,5 @@
 """``e-beam``: a film written by electrons and etched, composed of parts."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

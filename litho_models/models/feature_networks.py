@@ -4,10 +4,7 @@ The features have no parameters, so that such a network is fitted to single pixe
 (``litho_models.fitting.pixels``): seconds, where a network of crops takes minutes.
 """
 
-from __future__ import annotations
-
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import abstractmethod
 from itertools import pairwise
 from typing import ClassVar
 
@@ -15,10 +12,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
-from litho_models.models.features import neighbours
+from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
 # Change over σ, relative to the highest level, below which the length of a slope is rounded off, so that it
@@ -48,7 +44,7 @@ class ScanAxisConfig(FeatureNetworkConfig):
     shifts_um: Widths = (0.1, 0.2, 0.4, 0.8, 1.6)
 
 
-class FeatureNetwork(nn.Module, ABC):
+class FeatureNetwork(OfField, nn.Module):
     """A function of the features of each pixel, µm: linear, and beside it a network; zero at the start."""
 
     # Whether the network may add a height of its own, the same everywhere.
@@ -59,7 +55,7 @@ class FeatureNetwork(nn.Module, ABC):
     def __init__(self, config: FeatureNetworkConfig, pitch_um: float, full_height_um: float):
         super().__init__()
         self.config, self.pitch_um, self.full_height_um = config, pitch_um, full_height_um
-        count = self.feature_count
+        count = self.feature_count = len(self.features(self._point()))
         self.register_buffer("centre", torch.zeros(count))
         self.register_buffer("scale", torch.ones(count))
         self.linear = nn.Linear(count, 1, bias=self.has_constant)
@@ -71,22 +67,16 @@ class FeatureNetwork(nn.Module, ABC):
         for weight in (*self.linear.parameters(), last.weight):
             nn.init.zeros_(weight)
 
-    @property
-    @abstractmethod
-    def feature_count(self) -> int:
-        """Number of features."""
-
     @abstractmethod
     def features(self, field_um: Tensor) -> list[Tensor]:
         """Features (b, 1, y - 2r, x - 2r) of a field (b, 1, y, x), r = ``reach_px``."""
 
     @property
     def reach_px(self) -> int:
-        """How far features reach."""
         config = self.config
-        steep = 1 + self._radius(config.slope_blurs_um[:1]) + self._radius(config.steep_um)
-        slopes = 1 + self._radius(config.slope_blurs_um)
-        return max(self._radius(config.blurs_um), slopes, self._steps_px()[-1], steep)
+        steep = 1 + self._radius(config.slope_blurs_um[0]) + self._radius(*config.steep_um)
+        slopes = 1 + self._radius(*config.slope_blurs_um)
+        return max(self._radius(*config.blurs_um), slopes, self._steps_px()[-1], steep)
 
     def forward(self, field_um: Tensor) -> Tensor:
         """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
@@ -117,28 +107,13 @@ class FeatureNetwork(nn.Module, ABC):
         self.centre.copy_(centre)
         self.scale.copy_(scale)
 
-    def _blurred(self, field: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
-        return blurred_interior(field, sigma_um, self.pitch_um, self.reach_px - margin_px)
-
     def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
         """Means around each pixel, of a field with a margin."""
         return [blurred_interior(field, width, self.pitch_um, margin_px) for width in self.config.steep_um]
 
-    def _radius(self, sigmas_um: Sequence[float]) -> int:
-        return max((kernel_radius_px(sigma / self.pitch_um) for sigma in sigmas_um), default=0)
-
-    def _steps_px(self) -> list[int]:
-        return sorted(max(1, round(shift / self.pitch_um)) for shift in self.config.shifts_um)
-
 
 class Surroundings(FeatureNetwork):
     """Of the layout around a pixel, x and y alike: blurs, slopes, displaced copies, mean steepness."""
-
-    @property
-    def feature_count(self) -> int:
-        config = self.config
-        groups = len(config.blurs_um), 2 * len(config.slope_blurs_um), 3 * len(config.shifts_um)
-        return 1 + sum(groups) + 2 * len(config.steep_um)
 
     def features(self, field_um: Tensor) -> list[Tensor]:
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
@@ -154,7 +129,7 @@ class Surroundings(FeatureNetwork):
             found.append(sum(sides[1:], sides[0]))
             found.append(sum(((side - here).abs() for side in sides), torch.zeros_like(here)))
             found.append((sides[1] - sides[0]).abs() + (sides[3] - sides[2]).abs())
-        margin = self._radius(config.steep_um)
+        margin = self._radius(*config.steep_um)
         sigma = config.slope_blurs_um[0]
         length, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
         return found + self._averaged(length, margin) + self._averaged(length * length, margin)
@@ -179,12 +154,6 @@ class ScanAxis(FeatureNetwork):
     def at_pixels(self, features: Tensor) -> Tensor:
         return super().at_pixels(features) - super().at_pixels(torch.zeros_like(features[:, :1]))
 
-    @property
-    def feature_count(self) -> int:
-        config = self.config
-        groups = len(config.blurs_um), 3 * len(config.slope_blurs_um), 5 * len(config.shifts_um)
-        return sum(groups) + 2 * len(config.steep_um)
-
     def features(self, field_um: Tensor) -> list[Tensor]:
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
         here = crop_border(field, reach)
@@ -198,7 +167,7 @@ class ScanAxis(FeatureNetwork):
             _, _, left, right = neighbours(crop_border(field, reach - step), step)
             before, after = left - here, right - here
             found += [before, after, before.abs(), after.abs(), (right - left).abs()]
-        margin = self._radius(config.steep_um)
+        margin = self._radius(*config.steep_um)
         sigma = config.slope_blurs_um[0]
         slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
         return found + self._averaged(slope.abs(), margin) + self._averaged(slope * slope, margin)

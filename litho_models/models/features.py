@@ -1,10 +1,9 @@
 """Linear in many features of the layout: how far blurs, slopes and their products go without a network."""
 
-from __future__ import annotations
-
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -39,7 +38,36 @@ class FeaturesConfig(SimulatorConfig):
     steep_widths_um: tuple[float, ...] = Field((), description="over how much around a pixel, µm")
 
 
-class Features(Simulator):
+class OfField(ABC):
+    """What features of a field have in common: blurs, displacements, and how far they reach."""
+
+    config: Any
+    pitch_um: float
+
+    @property
+    @abstractmethod
+    def reach_px(self) -> int:
+        """How far features reach."""
+
+    def _point(self) -> Tensor:
+        """The smallest field that has features, of one pixel."""
+        side = 2 * self.reach_px + 1
+        return torch.zeros(1, 1, side, side)
+
+    def _blurred(self, field: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
+        reach = self.reach_px - margin_px
+        return (
+            blurred_interior(field, sigma_um, self.pitch_um, reach) if sigma_um else crop_border(field, reach)
+        )
+
+    def _steps_px(self) -> list[int]:
+        return sorted(max(1, round(shift_um / self.pitch_um)) for shift_um in self.config.shifts_um)
+
+    def _radius(self, *sigmas_um: float) -> int:
+        return max((kernel_radius_px(sigma / self.pitch_um) for sigma in sigmas_um), default=0)
+
+
+class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
     φ: blurs with their cubes and the products of each two; slopes along y and x at several blurs, their
@@ -56,17 +84,17 @@ class Features(Simulator):
 
     def __init__(self, config: FeaturesConfig):
         super().__init__(config)
-        weights = torch.zeros(feature_count(config))
+        weights = torch.zeros(sum(map(len, self.features(self._point()))))
         weights[0] = config.full_height_um
         self.weights = nn.Parameter(weights)
 
     @property
     def reach_px(self) -> int:
         config = self.config
-        blurs = (*config.sigmas_um, *config.slope_sigmas_um, *config.streak_sigmas_um)
+        blurs = self._radius(*config.sigmas_um, *config.slope_sigmas_um, *config.streak_sigmas_um)
         displaced = self._steps_px()[-1] + self._radius(config.shift_sigma_um)
-        steep = self._widest(config.steep_sigmas_um) + self._widest(config.steep_widths_um)
-        return max(self._widest(blurs) + 1, displaced, steep + 1)
+        steep = self._radius(*config.steep_sigmas_um) + self._radius(*config.steep_widths_um)
+        return max(blurs + 1, displaced, steep + 1)
 
     def interior(self, layout_um: Tensor) -> Tensor:
         simple, products = self.features(layout_um)
@@ -122,31 +150,14 @@ class Features(Simulator):
     def _steepness(self, layout: Tensor) -> list[Tensor]:
         """Means around each pixel of the sizes and squares of slopes along y and x; of slopes in σ per σ."""
         widths, found = self.config.steep_widths_um, []
-        margin = self._widest(widths)
+        margin = self._radius(*widths)
         for sigma in self.config.steep_sigmas_um:
             up, down, left, right = neighbours(self._blurred(layout, sigma, margin_px=margin + 1), 1)
-            for slope in (
-                (down - up) * (sigma / self.pitch_um / 2),
-                (right - left) * (sigma / self.pitch_um / 2),
-            ):
+            for across in (down - up, right - left):
+                slope = across * (sigma / self.pitch_um / 2)
                 sizes = slope.abs(), slope * slope
                 found += [blurred_interior(s, w, self.pitch_um, margin) for s in sizes for w in widths]
         return found
-
-    def _blurred(self, layout: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
-        reach = self.reach_px - margin_px
-        if not sigma_um:
-            return crop_border(layout, reach)
-        return blurred_interior(layout, sigma_um, self.pitch_um, reach)
-
-    def _steps_px(self) -> list[int]:
-        return sorted(max(1, round(shift_um / self.pitch_um)) for shift_um in self.config.shifts_um)
-
-    def _widest(self, sigmas_um: Sequence[float]) -> int:
-        return max((self._radius(sigma) for sigma in sigmas_um), default=0)
-
-    def _radius(self, sigma_um: float) -> int:
-        return kernel_radius_px(sigma_um / self.pitch_um)
 
 
 class RandomFeaturesConfig(FeaturesConfig):
@@ -176,7 +187,7 @@ class RandomFeatures(Features):
 
     def __init__(self, config: RandomFeaturesConfig):
         super().__init__(config)
-        count = simple_count(config)
+        count = len(self.features(self._point())[0])
         random = torch.Generator().manual_seed(config.seed)
         seen = torch.rand(config.units, count, generator=random).argsort(dim=1) < config.inputs
         size = min(config.inputs, count) ** 0.5
@@ -229,16 +240,3 @@ def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor
     """Pixels ``step`` above, below, left and right of those farther than ``step`` from the edge."""
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]
-
-
-def simple_count(config: FeaturesConfig) -> int:
-    """Number of features that are no products."""
-    count = len(config.sigmas_um) + 8 * len(config.slope_sigmas_um) + 10 * len(config.shifts_um)
-    steep = 4 * len(config.steep_sigmas_um) * len(config.steep_widths_um)
-    return count + 2 * len(config.streak_sigmas_um) + steep
-
-
-def feature_count(config: FeaturesConfig) -> int:
-    """Number of features that a config has, without random ones."""
-    blurs = len(config.sigmas_um)
-    return simple_count(config) + blurs * (blurs + 1) // 2 + blurs + 8 * len(config.slope_sigmas_um) + 1

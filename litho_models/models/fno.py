@@ -6,8 +6,6 @@ the whole image, to a local convolution. It is periodic in the image and its mod
 image, so it answers differently for another image size: ``default`` runs it on tiles of one size.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar, Self
 

@@ -3,8 +3,6 @@
 Fields are (batch, 1, y, x), relative to a full dose or height; values are tensors, which can be fitted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -4,8 +4,6 @@ Optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dos
 shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal

@@ -11,14 +11,14 @@ the rate; with three new prints the rule comes close to the t test of their mean
 that is not told the spread.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import nct
 from scipy.stats import t as student
+
+from litho_data.foundation.kinds import Array
 
 # Prints within which a step is to be noticed.
 SOON = 3
@@ -36,10 +36,10 @@ class Series(NamedTuple):
         reference_variance: (n,); ``new_variance``: (m,).
     """
 
-    reference: np.ndarray
-    new: np.ndarray
-    reference_variance: np.ndarray
-    new_variance: np.ndarray
+    reference: Array
+    new: Array
+    reference_variance: Array
+    new_variance: Array
 
 
 class Step(NamedTuple):
@@ -55,14 +55,14 @@ class Step(NamedTuple):
     ci95: tuple[float, float]
 
 
-def shares(new_prints: int) -> np.ndarray:
+def shares(new_prints: int) -> Array:
     """Share of the rate of each comparison, by its first changed print, (m,); they add up to 1."""
     young = min(SOON, new_prints) - 1
     old = new_prints - young
     return np.concatenate([np.full(old, (1 - young * _YOUNG) / old), np.full(young, _YOUNG)])
 
 
-def step_statistics(series: Series) -> tuple[np.ndarray, np.ndarray]:
+def step_statistics(series: Series) -> tuple[Array, Array]:
     """Step and its standard error for every first changed print, (m, ...) each.
 
     Their ratio is a t of n + m - 2 degrees of freedom where nothing has changed.
@@ -97,9 +97,7 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
     return Step(since, size, (size - half, size + half)), min(1.0, float(chance[since]))
 
 
-def chance_to_notice(
-    step: float, reference_variance: np.ndarray, new_variance: np.ndarray, rate: float
-) -> float:
+def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
     """Chance that a rise raises an alarm once ``SOON`` prints show it, or all new ones if these are fewer.
 
     By the noncentral t of the one comparison that starts with the rise, so at least this.
@@ -113,9 +111,7 @@ def chance_to_notice(
     return float(nct.sf(limit, freedom, step / error))
 
 
-def noticeable_step(
-    reference_variance: np.ndarray, new_variance: np.ndarray, rate: float, power: float = 0.9
-) -> float:
+def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
     """The step that ``chance_to_notice`` gives this chance; infinite beyond ten thousand standard errors."""
     error = _comparison(reference_variance, new_variance, rate)[2]
 
@@ -125,9 +121,7 @@ def noticeable_step(
     return error * float(brentq(beyond, 0, _LARGEST)) if beyond(_LARGEST) > 0 else float("inf")
 
 
-def _comparison(
-    reference_variance: np.ndarray, new_variance: np.ndarray, rate: float
-) -> tuple[float, int, float]:
+def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
     """Limit of t, degrees of freedom and standard error of the last ``SOON`` prints against those before."""
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

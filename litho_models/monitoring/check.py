@@ -1,7 +1,5 @@
 """``litho-models check``: does a printer still behave as its frozen model says, and when to look again."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -73,14 +71,10 @@ def _checked(
     tolerance: float | None,
 ) -> Check:
     found = gather(frozen, dataset, reference, new, residuals)
-    figures, limits = list(FIGURES), []
-    if wording.too_optimistic(found.reference, frozen.card["parameters"]):
-        figures = [figure for figure in figures if figure.name != "error"]
-        limits.append(
-            f"The error is not judged: with {frozen.card['parameters']} parameters the model fits the "
-            "reference prints, which it has seen, better than new ones. --residuals of a benchmark of the "
-            "reference, or a --reference of other prints, allows it."
-        )
+    parameters = frozen.card["parameters"]
+    # Of prints that the model has seen, the error is too small to compare others with.
+    optimistic = wording.too_optimistic(found.reference, parameters)
+    figures = [figure for figure in FIGURES if figure.name != "error" or not optimistic]
     judged = judge(
         found.reference,
         found.new,
@@ -100,5 +94,5 @@ def _checked(
         figures=judged,
         reference_scans=found.reference,
         new_scans=found.new,
-        notes=[*limits, *wording.notes(found.reference, found.new, judged)],
+        notes=wording.notes(found.reference, found.new, judged, parameters),
     )

@@ -1,7 +1,5 @@
 """What is checked against what: the scans of a store, and a reference from a store, a print or a card."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +14,7 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.frozen.on_store import locked_by_the_card, made_of_these_prints, predict_frozen, trained_ids
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.noise.residuals import read_residuals
-from litho_models.scoring.metrics import ScanFigures, scan_figures
+from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
 # A printer whose heights are half or twice those of its model is another one.

@@ -1,7 +1,5 @@
 """From figures of scans to a judgement of each figure: pure, without files or models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,7 +12,7 @@ from litho_models.monitoring.change_point import (
     noticeable_step,
 )
 from litho_models.monitoring.prints import FIGURES, Alarm, Figure, FigureCheck, print_values, spread_of
-from litho_models.scoring.metrics import ScanFigures
+from litho_models.scoring.printer_state import ScanFigures
 
 
 class Trend(NamedTuple):
@@ -44,20 +42,17 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
         reference: bool (n,), which prints are of the reference.
         tolerance: largest drift, in the unit of ``values``.
     """
-    n, weight = len(values), 1 / variance
+    n = len(values)
     place = np.arange(n)
-    away = place - np.average(place, weights=weight)
-    power = float((weight * away**2).sum())
-    slope = float((weight * away * values).sum()) / power
-    rest = values - np.average(values, weights=weight) - slope * away
-    error = float(np.sqrt((weight * rest**2).sum() / (n - 2) / power))
+    (slope, _), covariance = np.polyfit(place, values, 1, w=np.sqrt(1 / variance), cov=True)
+    error = float(np.sqrt(covariance[0, 0]))
     half = float(student.ppf(0.975, n - 2)) * error
     fastest = max(abs(slope - half), abs(slope + half))
     since_middle = n - 1 - float(place[reference].mean())
     # Beyond a million prints the number says nothing.
     left = int(np.clip(tolerance / fastest - since_middle, 0, 1e6)) if fastest > 0 else 10**6
     p = 2 * float(student.sf(abs(slope) / error, n - 2)) if error > 0 else float(slope == 0)
-    return Trend(slope, (slope - half, slope + half), p, left)
+    return Trend(float(slope), (slope - half, slope + half), p, left)
 
 
 DEFAULT_RATE = 0.005

@@ -1,7 +1,5 @@
 """``check.json``, and the figures it watches: one value per print of each, and how much prints differ."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
@@ -11,7 +9,7 @@ from scipy.stats import chi2
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.scoring.metrics import ScanFigures
+from litho_models.scoring.printer_state import ScanFigures
 
 _LEAST_GAIN = 0.01
 
@@ -49,6 +47,7 @@ FIGURES = (
         0.2,
     ),
 )
+WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):

@@ -9,8 +9,7 @@ import numpy as np
 
 from litho_data.reports.page import Page
 from litho_data.reports.pictures import new_figure
-from litho_models.monitoring.prints import Check, FigureCheck, print_values
-from litho_models.monitoring.wording import figure_of
+from litho_models.monitoring.prints import WATCHED, Check, FigureCheck, print_values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +53,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
 
     figure = new_figure(8.5, 3.4)
     axes = figure.subplots()
-    watched = figure_of(one)
+    watched = WATCHED[one.name]
     start = 0
     for rows, colour, label in (
         (result.reference_scans, "#5b6675", "reference"),

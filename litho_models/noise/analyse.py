@@ -1,7 +1,5 @@
 """``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,14 +7,13 @@ from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
+from litho_data.reports.page import filled
 from litho_data.store import open_store
-from litho_models.noise.budget import NoiseBudget, noise_budget
+from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import (
     Reference,
-    ReferencePrints,
-    RepeatedPrints,
     reference_prints,
     repeated_prints,
     store_references,
@@ -60,17 +57,21 @@ def analyse_noise(
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
         # A dose often has one print, without which it is lost, and no model is judged by the matrix.
-        in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
-        if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
-            notes.append(
-                f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}."
-            )
+        of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
+        in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
-            f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
+            f"{scan_id}: lock box" + ", in the dose matrix only" * (scan_id in in_matrix)
             for scan_id in locked
         ]
         repeats = repeated_prints(scans)
         budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
+        limits = filled(
+            Path(__file__).with_name("notes.jinja"),
+            found=found,
+            repeats=repeats,
+            budget=budget,
+            in_matrix=in_matrix,
+        )
         result = NoiseAnalysis(
             run=run_info([seed], len(scans), dropped),
             dataset=dataset.dataset_id,
@@ -80,7 +81,7 @@ def analyse_noise(
             dose=dose,
             budget=budget,
             spread=analyse_spread(spread, seed) if spread is not None else None,
-            notes=[*_notes(found, repeats, budget), *notes],
+            notes=[*limits.splitlines(), *notes],
         )
         write_noise_report(result, references, out)
         result.write(out)
@@ -129,20 +130,3 @@ def analyse_noise_of_files(
         write_noise_report(result, references, out)
         result.write(out)
     return result
-
-
-def _notes(found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None) -> list[str]:
-    notes = []
-    if not found.flats and repeats is None:
-        how = (
-            "estimated from what a model leaves, not measured"
-            if budget is not None
-            else "not measured; what a model leaves of unseen scans gives an estimate (--residuals)"
-        )
-        notes.append(
-            f"No flat and no repeated print in the store: the noise is {how}. One flat print, or one repeat "
-            "of any layout, would measure it."
-        )
-    if found.flats and not found.substrates:
-        notes.append("No bare substrate: the flat print's roughness includes microscope and substrate.")
-    return notes

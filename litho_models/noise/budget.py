@@ -4,8 +4,6 @@ Two estimates that err on the same side: what differs between like surroundings 
 rough the places are where the layout is flat, so that a model has little to get wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Is a stated spread right? Judged on prints that it was not fitted on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -10,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.residuals import Residuals
@@ -29,7 +28,7 @@ from litho_models.noise.variance import (
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
 # Their roughness is correlated over ten pixels and more: more of them tell nothing new.
@@ -128,7 +127,7 @@ class SpreadAnalysis(Record):
 class Stated(NamedTuple):
     """What is said of the residual of one scan: its scale at each pixel, nm, and the shape over it."""
 
-    scale_nm: np.ndarray
+    scale_nm: Array
     tails: Tails
 
 
@@ -158,7 +157,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     for number in np.unique(fold):
         learned = np.flatnonzero(fold != number)
         residual = np.concatenate([samples[i] for i in learned])
-        flat = float(np.sqrt(np.mean(residual**2)))
+        flat = rms(residual)
         beta, tails = fit_spread(np.concatenate([designs[i] for i in learned]), residual)
         for i in np.flatnonzero(fold == number).tolist():
             constant[i] = Stated(np.full(scans[i].shape, flat), GAUSSIAN)
@@ -170,13 +169,13 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
             Stated(np.hypot(own.scale_nm, apart), own.tails)
             for own, apart in zip(by_covariates, found.disagreement_nm, strict=True)
         ]
-        epistemic = float(np.sqrt(np.mean([np.mean(d**2) for d in found.disagreement_nm])))
+        epistemic = rms([rms(apart) for apart in found.disagreement_nm])
     finite = np.concatenate([residual[np.isfinite(residual)] for residual in residuals])
     return SpreadAnalysis(
         model=found.model,
         members=found.members,
         held_out=found.held_out,
-        residual_rms_nm=float(np.sqrt(np.mean(finite**2))),
+        residual_rms_nm=rms(finite),
         residual_mae_nm=float(np.abs(finite).mean()),
         epistemic_rms_nm=epistemic,
         variance=variance_model(*fit_spread(np.concatenate(designs), np.concatenate(samples))),
@@ -188,7 +187,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 
 
 def calibrate(
-    name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[np.ndarray], stated: Sequence[Stated]
+    name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
     """Judge a stated spread on every scan; pixels first, then scans."""
     rows = []
@@ -204,7 +203,7 @@ def calibrate(
                 nll=float(-tails.log_likelihood(r, s).mean()),
                 crps_nm=float(tails.crps(r, s).mean()),
                 coverage=[float(tails.covered(r, s, level).mean()) for level in COVERAGE_LEVELS],
-                standardised_rms=float(np.sqrt(np.mean((r / s) ** 2)) / tails.sd),
+                standardised_rms=rms(r / s) / tails.sd,
                 factor_90=float(np.quantile(np.abs(r / s), 0.9) / tails.half_width(0.9)),
                 ence=normalised_calibration_error(r, tails.sd * s),
                 ause=sparsification_error(r, s),
@@ -225,14 +224,14 @@ def calibrate(
 
 def _bins(
     scans: Sequence[PrintedScan],
-    places: Sequence[dict[str, np.ndarray]],
-    residuals_nm: Sequence[np.ndarray],
+    places: Sequence[dict[str, Array]],
+    residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> list[SigmaBin]:
     """All pixels, each level, and ranges of equal count of what else the spread depends on."""
     used = [np.isfinite(residual) for residual in residuals_nm]
 
-    def pooled(maps: Sequence[np.ndarray]) -> np.ndarray:
+    def pooled(maps: Sequence[Array]) -> Array:
         return np.concatenate([field[use] for field, use in zip(maps, used, strict=True)])
 
     residual = pooled(residuals_nm)
@@ -246,7 +245,7 @@ def _bins(
     ]
     prints = [scan.print_id for scan in scans]
 
-    def judged(covariate: str, low: float, high: float, mine: np.ndarray) -> SigmaBin:
+    def judged(covariate: str, low: float, high: float, mine: Array) -> SigmaBin:
         coverage = [float(within[mine].mean()) for within in inside]
         intervals = [pixel_interval(within[mine], owner[mine], prints) for within in inside]
         return SigmaBin(
@@ -254,8 +253,8 @@ def _bins(
             low=low,
             high=high,
             pixels=int(mine.sum()),
-            rms_nm=float(np.sqrt(np.mean(residual[mine] ** 2))),
-            predicted_nm=float(np.sqrt(np.mean(sigma[mine] ** 2))),
+            rms_nm=rms(residual[mine]),
+            predicted_nm=rms(sigma[mine]),
             coverage_68=coverage[0],
             coverage_68_ci95=intervals[0],
             coverage_95=coverage[1],
@@ -290,7 +289,7 @@ def conformal_factor(factors: Sequence[float], level: float = CONFORMAL_LEVEL) -
     return None if rank > len(factors) else float(np.sort(factors)[rank - 1])
 
 
-def _sample(residual: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
+def _sample(residual: Array, seed: int) -> tuple[Array, ...]:
     """Row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:

@@ -4,8 +4,6 @@ The paper's search for a laser power (appendix "Mask and optical elements fabric
 that carry a dose: step ladders, or any layout with areas of one level wider than the printer's blur.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

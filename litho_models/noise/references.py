@@ -1,7 +1,5 @@
 """Scans made to measure the noise: bare substrate, flat print, steps; and what they say."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,7 +21,7 @@ from litho_models.noise.surface import (
     without_background,
 )
 from litho_models.noise.texture import Texture, texture
-from litho_models.scoring.statistics import interval
+from litho_models.scoring.statistics import interval, rms
 
 _SQUARE_WITHIN = 0.01
 # That two prints of one layout must have in common.
@@ -138,13 +136,13 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
                     continue
                 rest = NM_PER_UM * without_background(difference, "quadratic")
                 rest = rest[np.isfinite(rest)] / np.sqrt(2)
-                sigmas.append(float(np.sqrt(np.mean(rest**2))))
+                sigmas.append(rms(rest))
                 absolute.append(float(np.abs(rest).mean()))
                 members |= {first.id, second.id}
     if not sigmas:
         return None
     return RepeatedPrints(
-        sigma_nm=float(np.sqrt(np.mean(np.square(sigmas)))),
+        sigma_nm=rms(sigmas),
         ci95_nm=interval(sigmas),
         mae_nm=float(np.mean(absolute)),
         scans=len(members),

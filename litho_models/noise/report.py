@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.reports.page import Page
+from litho_data.reports.page import Page, filled
 from litho_models.evaluation.tables import interval_text
 from litho_models.noise import plots
 from litho_models.noise.budget import NoiseBudget
@@ -32,12 +32,11 @@ _FREE = {
 
 def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], out: str | Path) -> Path:
     """Render the result into ``out``; returns the page."""
-    floor = result.noise_floor
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
     page = Page(title, run=result.run, facts=facts, words=Path(__file__).with_name("words.toml"))
-    page.verdict(_verdict(floor))
+    page.verdict(noise_verdict(result.noise_floor))
     page.note(*result.notes)
     if references:
         _references(page, result, references)
@@ -55,17 +54,9 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     return page.write(out)
 
 
-def _verdict(floor: NoiseFloor) -> str:
-    if floor.mae_nm is None:
-        return f"These data do not bound the noise: {floor.source}."
-    known = f"{floor.mae_nm:.2f} nm" + (f" (σ {floor.rmse_nm:.2f} nm)" if floor.rmse_nm is not None else "")
-    if floor.kind == "upper-estimate":
-        return (
-            f"At most {known} of a model's mean error is noise that no model can predict; what it has above "
-            f"that can still be won. Source: {floor.source}."
-        )
-    kind = floor.kind.replace("-", " ")
-    return f"No model can have a mean error below {known} ({kind}). Source: {floor.source}."
+def noise_verdict(floor: NoiseFloor) -> str:
+    """What of a model's error is noise, in one sentence."""
+    return filled(Path(__file__).with_name("verdict.jinja"), floor=floor).strip()
 
 
 def _references(page: Page, result: NoiseAnalysis, references: Sequence[Reference]) -> None:

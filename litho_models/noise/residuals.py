@@ -1,7 +1,5 @@
 """Where residuals come from: a benchmark's cache (out of fold) or frozen models; several make an ensemble."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan, Store
 from litho_models.frozen import zoo
@@ -18,7 +17,7 @@ from litho_models.frozen.on_store import card_background, predict_frozen, traine
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import Prediction
 
-Predictions = dict[str, list[np.ndarray]]
+Predictions = dict[str, list[Array]]
 
 
 class Residuals(NamedTuple):
@@ -33,9 +32,9 @@ class Residuals(NamedTuple):
 
     model: str
     scans: Sequence[PrintedScan]
-    maps_um: Sequence[np.ndarray]
-    residuals_nm: Sequence[np.ndarray]
-    disagreement_nm: Sequence[np.ndarray] | None
+    maps_um: Sequence[Array]
+    residuals_nm: Sequence[Array]
+    disagreement_nm: Sequence[Array] | None
     members: int
     held_out: bool
     protocol: NuisanceProtocol = NuisanceProtocol()
@@ -85,7 +84,7 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
     return Residuals(name, scans, maps, residuals, spread, count, held_out, protocol)
 
 
-def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
+def disagreement_um(predictions_um: Sequence[Array]) -> Array:
     """Standard deviation of the members at each pixel, each freed of its own mean: a datum is arbitrary.
 
     ``(ny, nx)`` µm, with the n − 1 of a sample.
@@ -127,7 +126,7 @@ def _of_benchmarks(
     return str(chosen), members, protocols[0]
 
 
-def _cached(folder: Path, model: str, key: str) -> dict[str, np.ndarray]:
+def _cached(folder: Path, model: str, key: str) -> dict[str, Array]:
     from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 
     cache = fit_folder(folder / "cache", model, key)

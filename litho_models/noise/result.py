@@ -1,7 +1,5 @@
 """``noise.json``: everything known about the noise of a dataset, and the floor that follows."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field, JsonValue

@@ -4,13 +4,13 @@ CRPS of a Gaussian after Gneiting and Raftery 2007, doi:10.1198/0162145060000014
 turned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betaln
 from scipy.stats import t as student
+
+from litho_data.foundation.kinds import Array
 
 COVERAGE_LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 # Mean absolute value of a Gaussian of standard deviation 1.
@@ -24,11 +24,11 @@ class Tails:
 
     freedom: float = float("inf")
 
-    def log_likelihood(self, residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+    def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
         """Log density per pixel; residual and scale in one unit, which decides the zero."""
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
-    def weight(self, z2: np.ndarray) -> np.ndarray | float:
+    def weight(self, z2: Array) -> Array | float:
         """−2 d log density / d z²: how much a squared residual counts, 1 for a Gaussian."""
         return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
 
@@ -42,7 +42,7 @@ class Tails:
         """Standard deviation over the scale; more than two degrees of freedom."""
         return float(student.std(self.freedom))
 
-    def probability_below(self, z: np.ndarray | float) -> np.ndarray:
+    def probability_below(self, z: Array | float) -> Array:
         """Distribution of z; of a residual over its scale it is uniform where both are right (PIT)."""
         return student.cdf(z, self.freedom)
 
@@ -50,11 +50,11 @@ class Tails:
         """Half width of the central interval that holds ``level``, over the scale."""
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
-    def covered(self, residual: np.ndarray, scale: np.ndarray | float, level: float) -> np.ndarray:
+    def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
         """Whether each pixel lies within the central interval that should hold ``level`` of them."""
         return np.abs(residual) <= self.half_width(level) * scale
 
-    def crps(self, residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+    def crps(self, residual: Array, scale: Array | float) -> Array:
         """Continuous ranked probability score in the unit of the residual.
 
         It is the mean absolute error of a prediction that states its own spread; for scale → 0 it is |r|. Of
@@ -71,7 +71,7 @@ class Tails:
 GAUSSIAN = Tails()
 
 
-def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray) -> float:
+def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     """ENCE: mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
     Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins hold equal counts; pixels of one σ stay
@@ -88,7 +88,7 @@ def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray) -> flo
     return float(np.mean(np.abs(stated - there) / stated))
 
 
-def sparsification_error(residual: np.ndarray, sigma: np.ndarray) -> float:
+def sparsification_error(residual: Array, sigma: Array) -> float:
     """AUSE: what the mean ``|r|`` is above the best possible while the pixels of largest σ are taken away.
 
     Area between the two curves over the share taken away, 0 to 1, in units of the mean ``|r|`` of all pixels;

@@ -1,18 +1,18 @@
 """Step prints: where the treads are, how high the steps, and how well neighbours can be told apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
 from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
+from litho_models.scoring.statistics import rms
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
@@ -67,7 +67,7 @@ class StepPrint(Record):
 
 def step_print(
     scan_id: str,
-    height_um: np.ndarray,
+    height_um: Array,
     pitch_um: tuple[float, float],
     level_height_um: float,
 ) -> StepPrint:
@@ -97,7 +97,7 @@ def step_print(
         deviations.append(np.abs(heights - np.median(heights)))
     records = []
     for number, step in enumerate(steps):
-        sigma = float(np.sqrt((sigmas[number] ** 2 + sigmas[number + 1] ** 2) / 2))
+        sigma = rms(sigmas[number : number + 2])
         # float32 heights of 1 µm carry 6e-5 nm.
         ratio = abs(step.height_nm) / max(sigma, 1e-4)
         records.append(
@@ -110,7 +110,7 @@ def step_print(
                 misread_if_gaussian=float(GAUSSIAN.probability_below(-ratio / 2)),
             )
         )
-    tread_sigma = float(np.sqrt(np.mean(np.square(sigmas))))
+    tread_sigma = rms(sigmas)
     block = max(1, round(_AREA_UM / pitch_across)), max(1, round(_AREA_UM / pitch_along))
     area_sigma = _sigma_of_block_means(flat, treads, block)
     return StepPrint(
@@ -128,7 +128,7 @@ def step_print(
     )
 
 
-def find_edges(height_um: np.ndarray, level_height_um: float) -> tuple[Axis, list[int]]:
+def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
     """The axis of a staircase and the pixels at which a new tread starts, ascending.
 
     The profile of medians is cut into constant pieces with the least squared error, each edge paid
@@ -157,7 +157,7 @@ def find_edges(height_um: np.ndarray, level_height_um: float) -> tuple[Axis, lis
     return chosen, found[chosen][1]
 
 
-def _piecewise_constant(profile: np.ndarray, price: float, narrowest: int) -> list[int]:
+def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[int]:
     """Least squared error plus ``price`` per edge, by dynamic programming over the last edge."""
     size = len(profile)
     sums = np.concatenate([[0.0], np.cumsum(profile)])
@@ -190,7 +190,7 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
     return treads
 
 
-def _without_plane(height_um: np.ndarray, treads: list[slice]) -> np.ndarray:
+def _without_plane(height_um: Array, treads: list[slice]) -> Array:
     """Heights freed of the one tilt that all treads share; NaN off the treads."""
     ny, nx = height_um.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
@@ -205,7 +205,7 @@ def _without_plane(height_um: np.ndarray, treads: list[slice]) -> np.ndarray:
     return np.where(usable, height_um - weights[0] * y - weights[1] * x, np.nan)
 
 
-def _misread(flat: np.ndarray, first: slice, second: slice) -> float:
+def _misread(flat: Array, first: slice, second: slice) -> float:
     below, above = (flat[:, tread][np.isfinite(flat[:, tread])] for tread in (first, second))
     if below.mean() > above.mean():
         below, above = above, below
@@ -213,7 +213,7 @@ def _misread(flat: np.ndarray, first: slice, second: slice) -> float:
     return float((np.mean(below > middle) + np.mean(above < middle)) / 2)
 
 
-def _sigma_of_block_means(flat: np.ndarray, treads: list[slice], block: tuple[int, int]) -> float | None:
+def _sigma_of_block_means(flat: Array, treads: list[slice], block: tuple[int, int]) -> float | None:
     """Pooled sd of the means of blocks (rows, columns) within treads, nm; None with fewer than two."""
     found = []
     for tread in treads:
@@ -227,7 +227,7 @@ def _sigma_of_block_means(flat: np.ndarray, treads: list[slice], block: tuple[in
     return pooled_sd(found) if found else None
 
 
-def pooled_sd(parts: Sequence[np.ndarray]) -> float:
+def pooled_sd(parts: Sequence[Array]) -> float:
     """Standard deviation within parts that have a mean each; 0 where no part has two values."""
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

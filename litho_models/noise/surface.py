@@ -1,7 +1,5 @@
 """How rough one surface is: bare substrate, flat print, or the treads of a staircase."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 
@@ -12,6 +10,7 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import amplitude_parameters, effective_samples
 from litho_models.noise.spread_scores import GAUSSIAN_MAE
+from litho_models.scoring.statistics import rms
 
 Background = Literal["offset", "quadratic"]
 BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
@@ -127,7 +126,7 @@ def pooled(surfaces: Sequence[SurfaceNoise]) -> SurfaceNoise:
     """Several surfaces of one kind as one: variances and mean absolute deviations averaged."""
     if len(surfaces) == 1:
         return surfaces[0]
-    sigma = float(np.sqrt(np.mean([one.sigma_nm**2 for one in surfaces])))
+    sigma = rms([one.sigma_nm for one in surfaces])
     independent = float(np.sum([one.independent_heights for one in surfaces]))
     return SurfaceNoise(
         id="+".join(one.id for one in surfaces),

@@ -3,8 +3,6 @@
 The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

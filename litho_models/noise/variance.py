@@ -5,11 +5,10 @@ likelihood, with the tails of Student's t. In two stages the spread cannot flatt
 tens of scans a few covariates are all that can be known (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
@@ -49,7 +48,7 @@ class VarianceModel(Record):
     freedom: float | None = None
 
 
-def place_maps(scan: PrintedScan) -> dict[str, np.ndarray]:
+def place_maps(scan: PrintedScan) -> dict[str, Array]:
     """``PLACES`` of each pixel of a scan, (ny, nx) each."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
@@ -67,14 +66,14 @@ def place_maps(scan: PrintedScan) -> dict[str, np.ndarray]:
     return dict(zip(PLACES, maps, strict=True))
 
 
-def covariates_of(places: dict[str, np.ndarray]) -> np.ndarray:
+def covariates_of(places: dict[str, Array]) -> Array:
     """φ of each pixel, (..., covariates), from ``place_maps`` or a choice of their pixels."""
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
     return np.stack([*between, slope, slope**2, edge, radius2, radius2**2], axis=-1)
 
 
-def layout_slope(scan: PrintedScan) -> np.ndarray:
+def layout_slope(scan: PrintedScan) -> Array:
     """Slope of the layout behind the optical spot, height over length, (ny, nx)."""
     from scipy.ndimage import gaussian_filter
 
@@ -83,7 +82,7 @@ def layout_slope(scan: PrintedScan) -> np.ndarray:
     return np.hypot(*np.gradient(blurred, scan.pitch_um))
 
 
-def fit_spread(covariates: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, Tails]:
+def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
     """Scale and tails that make the residuals most likely: β of ln s² = X β, and the shape."""
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
@@ -94,7 +93,7 @@ def fit_spread(covariates: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray
     return chosen
 
 
-def fit_log_scale(covariates: np.ndarray, residual: np.ndarray, tails: Tails = GAUSSIAN) -> np.ndarray:
+def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -> Array:
     """β of ln s² = X β by maximum likelihood, Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
 
     The information I of a pixel about ln s² does not depend on s; so one matrix serves all steps.
@@ -129,12 +128,12 @@ def fit_log_scale(covariates: np.ndarray, residual: np.ndarray, tails: Tails = G
     return beta
 
 
-def scale_nm(beta: np.ndarray, covariates: np.ndarray) -> np.ndarray:
+def scale_nm(beta: Array, covariates: Array) -> Array:
     """s of each pixel, nm; ``covariates`` (..., k)."""
     return np.exp(0.5 * covariates @ beta)
 
 
-def variance_model(beta: np.ndarray, tails: Tails) -> VarianceModel:
+def variance_model(beta: Array, tails: Tails) -> VarianceModel:
     """The fitted coefficients as a record."""
     freedom = None if np.isinf(tails.freedom) else tails.freedom
     return VarianceModel(covariates=list(COVARIATES), coefficients=beta.tolist(), freedom=freedom)

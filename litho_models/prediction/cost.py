@@ -1,7 +1,5 @@
 """What the prediction of a scan costs on the machine at hand: time and memory."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import re

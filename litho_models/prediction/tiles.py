@@ -1,9 +1,6 @@
 """Whole fields of any size: tiles that are exact where the model has a receptive radius, else blended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.layers.gaussian import pad_field
@@ -19,7 +17,7 @@ from litho_models.simulator import Simulator, Tile, crop_border
 TILE_PX = 1024
 
 
-class TileDifference(NamedTuple):
+class TileDifference(Record):
     """How much a height changes with the crop it is predicted in, nm."""
 
     max_nm: float
@@ -181,7 +179,9 @@ def tile_difference(
         )
     difference = (in_crop - in_whole).double() * NM_PER_UM
     return TileDifference(
-        float(difference.abs().max()), float(difference.square().mean().sqrt()), difference.numel()
+        max_nm=float(difference.abs().max()),
+        rms_nm=float(difference.square().mean().sqrt()),
+        pixels=difference.numel(),
     )
 
 

@@ -4,12 +4,11 @@ A feature is a connected part of the film or of the ground within it, of at leas
 film's height.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
 
 _LEAST_PX = 4
@@ -30,7 +29,7 @@ class FilmErrors(NamedTuple):
     merged: int
 
 
-def films_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> FilmErrors:
+def films_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> FilmErrors:
     """Compare the film of a scan with the predicted one, the per-scan terms removed."""
     return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
 
@@ -40,7 +39,7 @@ def film_edge_um(scan: PrintedScan) -> float:
     return (scan.levels - 1) * scan.level_height_um / 2
 
 
-def film_errors(measured_um: np.ndarray, expected_um: np.ndarray, edge_um: float) -> FilmErrors:
+def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmErrors:
     """Compare two films.
 
     Args:
@@ -60,7 +59,7 @@ def film_errors(measured_um: np.ndarray, expected_um: np.ndarray, edge_um: float
     )
 
 
-def _partners(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _partners(first: Array, second: Array) -> tuple[Array, Array]:
     """How many parts of the other each part of one touches, for the parts of either that are large enough."""
     from scipy.ndimage import label
 

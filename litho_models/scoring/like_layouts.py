@@ -5,13 +5,12 @@ it (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is 
 scans, so that datum, gain and bow of single scans count as the noise that they are to such a model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
@@ -29,11 +28,11 @@ class LikePixels(NamedTuple):
         partners: positions in these arrays, (n, m); no two of a row are of one scan.
     """
 
-    owner: np.ndarray
-    pixel: np.ndarray
-    partners: np.ndarray
+    owner: Array
+    pixel: Array
+    partners: Array
 
-    def noise_squared(self, residuals: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
         """What each pixel says of the variance of its noise, and its residual squared, (n,) each.
 
         With residuals r₀ and r₁ ... r_m, each a misfit that like surroundings share and noise, the mean of
@@ -53,9 +52,7 @@ class LikePixels(NamedTuple):
         return (difference.sum(axis=1) ** 2 - squares) / (count * (count - 1)), value**2
 
 
-def like_pixels(
-    scans: Sequence[PrintedScan], scored: Sequence[np.ndarray], seed: int = 0
-) -> LikePixels | None:
+def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
     """Draw pixels and find for each those of other scans whose layout surroundings are most like its own.
 
     Scans of different doses differ where their layouts do not: only prints of one dose are compared.
@@ -98,7 +95,7 @@ def like_pixels(
     return LikePixels(owner, np.concatenate([drawn[number] for number in used]), partners)
 
 
-def _surroundings(scan: PrintedScan) -> np.ndarray:
+def _surroundings(scan: PrintedScan) -> Array:
     """What the surroundings of each pixel look like: blurred layouts and two slopes, (k, ny·nx), µm."""
     from scipy.ndimage import gaussian_filter
 
@@ -109,7 +106,7 @@ def _surroundings(scan: PrintedScan) -> np.ndarray:
     return np.stack([field.ravel() for field in maps])
 
 
-def _whitened(feature: np.ndarray) -> np.ndarray:
+def _whitened(feature: Array) -> Array:
     """Features of unit covariance, so that the distance does not depend on their scale."""
     centred = feature - feature.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov(centred.T))

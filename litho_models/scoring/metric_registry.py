@@ -4,8 +4,6 @@ A metric sees one scan, what the model expects of it, and the residual freed of 
 that come with the package are fields of the results; one's own are listed there under ``metrics``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
@@ -13,13 +11,14 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
 from litho_models.scoring.films import FILMS_TEXT, films_of_scan
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.scoring.shapes import EDGES_TEXT, SIMILARITY_TEXT, edges_of_scan, similarity_of_scan
 
 Summary = Literal["mean", "sum"]
-MetricFunction = Callable[[PrintedScan, np.ndarray, np.ndarray], float | None]
+MetricFunction = Callable[[PrintedScan, Array, Array], float | None]
 
 
 class Metric(NamedTuple):
@@ -42,7 +41,7 @@ class Measurement(NamedTuple):
     """
 
     metrics: tuple[Metric, ...]
-    function: Callable[[PrintedScan, np.ndarray, np.ndarray], Sequence[float | None]]
+    function: Callable[[PrintedScan, Array, Array], Sequence[float | None]]
     explanation: str
     instrument: str = ""
 
@@ -118,7 +117,7 @@ def metrics_text() -> str:
     return " ".join(measurement.explanation for measurement in _MEASUREMENTS)
 
 
-def metrics_of(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> dict[str, Any]:
+def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> dict[str, Any]:
     """All metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
 
     Raises:

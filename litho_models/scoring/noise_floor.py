@@ -4,8 +4,6 @@ Measured on flat or repeated prints where there are any; else estimated from the
 model, by comparing pixels of like layout surroundings (``like_layouts``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.schema import Instrument
@@ -26,22 +27,22 @@ LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_
 class Prediction(NamedTuple):
     """What a model expects of a scan, (ny, nx) µm: the print, and what all scans add, if that is known."""
 
-    height_um: np.ndarray
-    background_um: np.ndarray | None = None
+    height_um: Array
+    background_um: Array | None = None
 
     @classmethod
-    def beside(cls, background: Background | None, height_um: np.ndarray) -> Prediction:
+    def beside(cls, background: Background | None, height_um: Array) -> Prediction:
         """The print and a learned background on its field, where there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @classmethod
-    def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: np.ndarray) -> Prediction:
+    def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
         """The print, and what a learned measurement model makes of it on the scan's field."""
         return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
-    def map_um(self) -> np.ndarray:
+    def map_um(self) -> Array:
         """The map that the microscope should show."""
         return self.height_um if self.background_um is None else self.height_um + self.background_um
 
@@ -102,14 +103,6 @@ class ScanRow(MetricValues, ScanErrors):
 
     scan: str
     print: str
-
-    @property
-    def line_covariance(self) -> np.ndarray | None:
-        """Covariance of slope and intercept (nm), (2, 2); None where it cannot be known."""
-        a, b, shared = self.slope_error, self.intercept_error_nm, self.slope_intercept_correlation
-        if a is None or b is None or shared is None:
-            return None
-        return np.array([[a * a, shared * a * b], [shared * a * b, b * b]])
 
 
 class ModelScores(MetricValues):

@@ -1,7 +1,5 @@
 """One routine that scores every model: predictions of scans in, one validated record out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +12,7 @@ from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import phase_waves, scan_errors
 from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import ModelScores, PolicyError, Prediction, ScanRow
-from litho_models.scoring.statistics import interval
+from litho_models.scoring.statistics import interval, rms
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
 # Policies without smooth terms of their own: only their errors know of a smooth background.
@@ -87,4 +85,4 @@ def _policy_errors(freed: Mapping[Policy, Sequence[CrossFit]]) -> list[PolicyErr
 
 
 def _line_sd_nm(fits: Sequence[CrossFit]) -> float:
-    return NM_PER_UM * float(np.sqrt(np.mean([fit.line_sd_um**2 for fit in fits])))
+    return NM_PER_UM * rms([fit.line_sd_um for fit in fits])

@@ -5,13 +5,12 @@ are those of marching squares, so a position is a linear interpolation between p
 and the roughness of the measured contour is part of the error.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scoring.films import film_edge_um
@@ -56,12 +55,12 @@ class _Contour(NamedTuple):
     along: FloatMap  # (n, 2), the higher side always on the same hand
 
 
-def similarity_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> float | None:
+def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
     """SSIM of a scan and its prediction, the per-scan terms removed (prediction plus residual)."""
     return structural_similarity(prediction_um + residual_um, prediction_um)
 
 
-def edges_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> EdgePlacement:
+def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> EdgePlacement:
     """Compare the edges of a scan with the predicted ones, the per-scan terms removed."""
     heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
     if scan.seen_by == "sem":
@@ -69,7 +68,7 @@ def edges_of_scan(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.
     return edge_placement(prediction_um + residual_um, prediction_um, heights, scan.pitch_um, search_um)
 
 
-def structural_similarity(measured_um: np.ndarray, expected_um: np.ndarray) -> float | None:
+def structural_similarity(measured_um: Array, expected_um: Array) -> float | None:
     """Mean SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861): 1 for equal maps.
 
     Gaussian window of standard deviation ``SSIM_SIGMA_PX``, ``SSIM_WINDOW_PX`` wide; data range
@@ -102,9 +101,9 @@ def structural_similarity(measured_um: np.ndarray, expected_um: np.ndarray) -> f
 
 
 def edge_placement(
-    measured_um: np.ndarray,
-    expected_um: np.ndarray,
-    heights_um: np.ndarray,
+    measured_um: Array,
+    expected_um: Array,
+    heights_um: Array,
     pitch_um: float,
     search_um: float = SEARCH_UM,
 ) -> EdgePlacement:
@@ -139,7 +138,7 @@ def mid_step_heights_um(levels: int, level_height_um: float) -> FloatMap:
     return np.arange(0.5, levels - 1, dtype=np.float64) * level_height_um
 
 
-def _contour(map_um: np.ndarray, height_um: float) -> _Contour:
+def _contour(map_um: Array, height_um: float) -> _Contour:
     from skimage.measure import find_contours
 
     lines = find_contours(np.asarray(map_um, np.float64), height_um)
@@ -149,7 +148,7 @@ def _contour(map_um: np.ndarray, height_um: float) -> _Contour:
     return _Contour(start[real], along[real])
 
 
-def _distance_px(of: _Contour, to: _Contour, search_px: float) -> NDArray[np.float64]:
+def _distance_px(of: _Contour, to: _Contour, search_px: float) -> FloatMap:
     """Distance of the middle of each piece from the nearest piece that rises to the same side, else inf."""
     from scipy.spatial import KDTree
 

@@ -1,13 +1,13 @@
 """Statistics over scans, or over prints. Pixels of a scan are correlated: what is drawn, and what changes its
 sign, is a whole scan; where scans of one print share its day and batch, a whole print."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
 # With fewer, no arrangement of signs is as rare as one in 20: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
@@ -22,6 +22,11 @@ _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
 # The observed signs are among the flips; rounding must not put a sum below itself.
 _ROUNDING = 1 - 1e-12
+
+
+def rms(values: ArrayLike) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def bootstrap_interval(
@@ -44,9 +49,7 @@ def bootstrap_interval(
     return _resampled(sums, counts, draws, seed)
 
 
-def pixel_interval(
-    values: np.ndarray, owner: np.ndarray, groups: Sequence[Hashable]
-) -> tuple[float, float] | None:
+def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> tuple[float, float] | None:
     """Interval of a mean over pixels, resampling prints, of which each counts with its pixels.
 
     None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
@@ -63,14 +66,14 @@ def pixel_interval(
     return _resampled(sums[seen], counts[seen], BOOTSTRAP_DRAWS, 0)
 
 
-def _resampled(sums: np.ndarray, counts: np.ndarray, draws: int, seed: int) -> tuple[float, float]:
+def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float, float]:
     picks = np.random.default_rng(seed).integers(0, sums.size, size=(draws, sums.size))
     means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.quantile(means, _ENDS)
     return float(low), float(high)
 
 
-def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[np.ndarray, np.ndarray]:
+def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
     """Sum and count of the values of each group; each value by itself without groups."""
     sample = np.asarray(values, np.float64)
     if groups is None:
@@ -84,7 +87,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
 
-def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> np.ndarray:
+def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
     """Signs (draws, count), the observed ones first: all of them up to ``exact_scans``, 10,000 beyond."""
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
@@ -92,7 +95,7 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
     return np.vstack([np.ones(count), drawn])
 
 
-def one_sided_flip_p(values: np.ndarray) -> float:
+def one_sided_flip_p(values: Array) -> float:
     """Share of sign flips of the scans' values whose sum reaches the observed one."""
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
@@ -162,7 +165,7 @@ class ByPrint(Record):
     p: float
 
 
-def by_print(values: np.ndarray, prints: Sequence[Hashable], seed: int = 0) -> ByPrint | None:
+def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrint | None:
     """Test whether scans of one print are more alike than scans of different prints.
 
     Args:

@@ -1,13 +1,12 @@
 """How an error depends on the level and on the spatial frequency."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import Field
 
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
@@ -48,7 +47,7 @@ class TransferCurves(Record):
     noise_band_y_per_um: float | None = None
 
 
-def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[np.ndarray]) -> list[LevelError]:
+def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
     """Bias (measured minus predicted) and standard deviation per layout level, over scored pixels.
 
     Args:
@@ -71,7 +70,7 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[np.ndarray
     return rows
 
 
-def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> TransferCurves:
+def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
     """Transfer, coherence and error from line spectra (Hann window, line mean removed), over all lines.
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to Nyquist of the layout pitch.
@@ -98,7 +97,7 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[np.nd
     return TransferCurves(**curves)
 
 
-def half_power_frequency(frequency: np.ndarray, gain: np.ndarray) -> float | None:
+def half_power_frequency(frequency: Array, gain: Array) -> float | None:
     """Where a gain (bands,) first falls below 1/√2 of the lowest band's, linear between bands; or None."""
     limit = np.sqrt(0.5) * gain[0]
     below = np.flatnonzero(gain < limit)
@@ -108,14 +107,12 @@ def half_power_frequency(frequency: np.ndarray, gain: np.ndarray) -> float | Non
     return float(np.interp(-limit, -gain[crossing], frequency[crossing]))
 
 
-def noise_equivalent_band(frequency: np.ndarray, gain: np.ndarray) -> float | None:
+def noise_equivalent_band(frequency: Array, gain: Array) -> float | None:
     """∫ gain² df over the gain² of the lowest band, for equal bands; None where that one is zero."""
     return float(np.sum(gain**2) * (frequency[1] - frequency[0]) / gain[0] ** 2) if gain[0] > 0 else None
 
 
-def _band_powers(
-    height: np.ndarray, prediction: np.ndarray, pitch_um: float, edges: np.ndarray
-) -> np.ndarray:
+def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
     """Sums over lines and the frequencies of each band, (5, bands): cross, measured, predicted, error, count.
 
     The error is a one-sided density (µm² per cycle/µm), the count that of its terms.

@@ -4,8 +4,6 @@ The unit is the whole scan, because the quadrants of one scan share its datum, t
 choice follows from a hash of the ids and a seed, so the same ids always give the same split.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -169,8 +169,8 @@ def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str,
             (a.vector == b.vector).all() for a, b in zip(own.per_fold, other[name].per_fold, strict=True)
         )
         assert (own.freed_nm2 == other[name].freed_nm2).all()
-    closed = SimpleNamespace(original=here.scans, study=here)
-    maps = [HeldOut(closed, study).maps_um(state) for study in studies]
+    found = [SimpleNamespace(original=here.scans, study=study) for study in studies]
+    maps = [HeldOut(one).maps_um(state) for one in found]
     assert all((own == its).all() for own, its in zip(*maps, strict=True))
     bases = [
         choose_base("features", scans, replace(study, scans=()), steps=None, cache=tmp_path / name).model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -116,3 +117,14 @@ def test_an_error_on_the_way_leaves_the_older_file(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "a.txt") as file:
         stop_half_way(file)
     assert contents(tmp_path) == {"a.txt": "older"}
+
+
+@pytest.mark.parametrize("mask", [0, 0o022, 0o077])
+def test_others_may_do_with_a_file_what_the_umask_says(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        with atomic_file(tmp_path / "a.txt") as file:
+            file.write_text("a")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o666 & ~mask

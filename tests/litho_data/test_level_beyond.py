@@ -221,6 +221,8 @@ def test_scars_shorter_or_wider_than_asked_stay() -> None:
     single = scars & (np.arange(SHAPE[0]) == 30)[:, None]
     assert not mark_scars(spoiled, min_length_px=61).any()
     np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=2), single)
+    np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=3), scars)
+    np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=1), single)
     assert not mark_scars(np.zeros(SHAPE)).any()
 
 

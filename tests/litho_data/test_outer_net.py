@@ -14,7 +14,7 @@ import pytest
 from litho_data.cards.card import load_card
 from litho_data.commands.app import new_app, run_app
 from litho_data.commands.settings import read_settings
-from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.begun import growing_folder, whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.names import is_plain_name
@@ -37,7 +37,7 @@ OUTSIDE: dict[str, tuple[Exception, str]] = {
     "too many files": (os_error(errno.EMFILE), "too many open files; .*ulimit -n"),
     "a read-only place": (os_error(errno.EROFS), "choose another --out"),
     "a file that went": (os_error(errno.ENOENT), "no such file"),
-    "an error without a number": (OSError("8 requested and 3 written"), "8 requested and 3 written"),
+    "an error without a number": (OSError("8 requested and 3 written"), "3 written; make room"),
     "no memory": (MemoryError(), "not enough memory, wanted"),
     "no memory for numpy": (MemoryError("Unable to allocate 8. EiB"), "not enough memory, got Unable"),
     "no memory for torch": (
@@ -45,6 +45,7 @@ OUTSIDE: dict[str, tuple[Exception, str]] = {
         "not enough memory",
     ),
     "no memory on a GPU": (CannotAllocate("CUDA out of memory. Tried"), "not enough memory"),
+    "a link to itself": (RuntimeError("Symlink loop from '/a/b'"), "leads to itself, got /a/b"),
     "too deep": (RecursionError("maximum recursion depth"), "parts within parts"),
     "too large": (OverflowError("int too large to convert to float"), "int too large"),
     "bad input": (InputError("x", got=1, wanted=2), "x, got 1, wanted 2"),
@@ -158,9 +159,12 @@ def test_what_no_file_can_hold_is_one_line(what: str, tmp_path: Path) -> None:
 def test_a_folder_under_a_pipe_cannot_be_written(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "nowhere").symlink_to(tmp_path / "there" / "not")
-    for name, words in (("pipe", "a file"), ("pipe/out", "cannot write"), ("nowhere", "cannot write")):
-        with pytest.raises(InputError, match=words), growing_folder(tmp_path / name, "a.json"):
-            pytest.fail("the work began")
+    (tmp_path / "itself").symlink_to(tmp_path / "itself")
+    for name in ("pipe", "pipe/out", "nowhere", "itself"):
+        words = "a file" if name == "pipe" else "cannot write"
+        for place in (growing_folder(tmp_path / name, "a.json"), whole_folder(tmp_path / name)):
+            with pytest.raises(InputError, match=words), place:
+                pytest.fail("the work began")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0, 1e300, 10**400, "0.1x", None, True])

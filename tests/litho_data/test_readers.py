@@ -16,25 +16,6 @@ from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 PITCH_UM = (SIZE_UM[0] / SHAPE[0], SIZE_UM[1] / SHAPE[1])
 
 
-def test_text_matrix(tmp_path: Path) -> None:
-    path = tmp_path / "scan.dat"
-    np.savetxt(path, HEIGHT_UM * 1e-6, fmt="%.9e", delimiter="\t", newline="\r\n")
-    scan = read_scan(path, unit="m", size_um=SIZE_UM)
-    assert scan.format == "text-matrix"
-    # Nine digits after the point: 1e-9 of the value.
-    np.testing.assert_allclose(scan.height_um, HEIGHT_UM, rtol=1e-9)
-    assert scan.pitch_um == pytest.approx(PITCH_UM, rel=1e-12)
-
-
-def test_tiff_of_real_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "scan.bin"
-    tifffile.imwrite(path, (HEIGHT_UM * 1000).astype(np.float32))
-    scan = read_scan(path, unit="nm", size_um=SIZE_UM)
-    # float32 keeps 24 bits: 6e-8 of the value.
-    np.testing.assert_allclose(scan.height_um, HEIGHT_UM, rtol=1e-7)
-    assert scan.format == "tiff"
-
-
 @pytest.mark.parametrize(("compression", "colours"), [("lzw", True), ("lzw", False), ("packbits", False)])
 def test_tiff_of_integers_takes_a_full_scale(tmp_path: Path, compression: str, colours: bool) -> None:
     path = tmp_path / "scan.tif"

@@ -20,7 +20,7 @@ EXPECTED_UM = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 def read(folder: Path, content: str | bytes, **arguments: object):
     path = folder / "scan.txt"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_scan(path, format="text-matrix", **({"unit": "m"} | arguments))
+    return read_scan(path, **({"unit": "m", "format": "text-matrix"} | arguments))
 
 
 @pytest.mark.parametrize(
@@ -41,10 +41,18 @@ def read(folder: Path, content: str | bytes, **arguments: object):
         ROWS.replace("e-007", "E-07"),
         ROWS.replace("1e", "1,0e").replace("4e", "4,0e"),
         ROWS.replace("\t", ";").replace("1e", "1,0e").replace("4e", "4,0e"),
+        ROWS.encode("utf-16"),
+        b"\xfe\xff" + ROWS.encode("utf-16-be"),
+        "% measured on Monday\n; by us\n" + ROWS,
+        "Height map of sample 7\n\nscan rate 1.5 Hz\n" + ROWS,
+        ROWS.replace("e", "D"),
+        ROWS.replace("1e", "1.0d").replace("e", "D"),
+        ROWS.replace("1e", "1,0D"),
+        ROWS.replace("\t", " , "),
     ],
 )
-def test_spellings(tmp_path: Path, content: str) -> None:
-    scan = read(tmp_path, content)
+def test_spellings(tmp_path: Path, content: str | bytes) -> None:
+    scan = read(tmp_path, content, format="auto")
     # Decimal to binary and the factor 1e6 round once each.
     np.testing.assert_allclose(scan.height_um, EXPECTED_UM, rtol=4e-16)
     assert scan.pitch_um is None
@@ -57,6 +65,21 @@ def test_gwyddion_comments_state_size_and_unit(tmp_path: Path) -> None:
     assert scan.pitch_um == (0.5, 1.0)
     np.testing.assert_allclose(scan.height_um, EXPECTED_UM / 100, rtol=4e-16)
     assert scan.header["Width"] == "3.00 µm"
+
+
+def test_the_hints_are_true(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"first row begins 1e-07, 2e-07.*unit 'm'"):
+        read(tmp_path, ROWS, unit=None)
+
+
+def test_headers_in_other_languages_state_size_and_unit(tmp_path: Path) -> None:
+    lines = "# Kanal: Topographie\n# Breite: 3,00 µm\n# Höhe: 1000 nm\n# Value units: nm\n"
+    scan = read(tmp_path, lines + ROWS.replace("e-007", ""), unit=None)
+    assert (scan.channel, scan.pitch_um) == ("Topographie", (0.5, 1.0))
+    lines = "h=2 w=3\npixel size=2e-006 m\ndata unit=rad\nheight conversion factor (-> m)=1e-007\n"
+    scan = read(tmp_path, lines + "1 2 3\n4 5 6\n", unit=None)
+    np.testing.assert_allclose(scan.height_um, EXPECTED_UM, rtol=4e-16)
+    assert scan.pitch_um == pytest.approx((2, 2))
 
 
 def test_isolated_nan_is_not_measured(tmp_path: Path) -> None:
@@ -86,11 +109,24 @@ def test_isolated_nan_is_not_measured(tmp_path: Path) -> None:
         ("1e-7 2e-7\n", "size in pixels"),
         ("0x10 1\n2 3\n", "line 1, got '0x10'"),
         ("1_0 1\n2 3\n", "line 1, got '1_0'"),
+        ("1,234.5;2,345.6\n1,234.5;2,345.6\n", r"line 1, got '1,234.5;2,345.6', wanted .*one separator"),
+        ("1,234.5\t2,345.6\n1,234.5\t2,345.6\n", "line 1, got .*one separator"),
+        ("1.5;2,5\n1.5;2.5\n", "line 1, got .*one separator"),
+        ("1.5;2.5\n1,5;2.5\n", "line 2, got .*one separator"),
+        ("1 2\n1e400 3\n", "line 2, got '1e400', wanted a number below"),
+        ("1 2\nx y 3 4\n", "line 2.*first rows are '1 2' | 'x y 3 4'"),
     ],
 )
 def test_damage_is_named(tmp_path: Path, content: str | bytes, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message) as caught:
         read(tmp_path, content)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("row", "kind"), [("0 1\n", "a profile"), ("0 1 2\n", "a point cloud")])
+def test_points_are_no_map(tmp_path: Path, row: str, kind: str) -> None:
+    with pytest.raises(InputError, match=f"holds {kind}.*wanted a height map"):
+        read(tmp_path, row * 9, format="auto")
 
 
 @pytest.mark.measured

@@ -17,7 +17,6 @@ from litho_data.register import Bend, Registration, apply_transform, register_sc
 from litho_data.register.bend import fit_bent_affine
 from litho_data.register.geometry import index_to_um, orient, orientation_matrix
 from litho_data.register.quality import judge
-from litho_data.register.refine import refine
 from litho_data.store import open_store
 from litho_data.virtual_fab import KnobSetting, Truth, simulate
 from litho_data.virtual_fab.canvas import GUARD_PX
@@ -191,22 +190,6 @@ def test_points_on_a_line_do_not_determine_a_bend():
     on_a_line = bend.middle + np.linspace(-1, 1, 9)[:, None] * bend.half
     with pytest.raises(np.linalg.LinAlgError):
         fit_bent_affine(on_a_line, on_a_line, bend.middle, bend.half)
-
-
-@pytest.mark.parametrize("middle_px", [130, 120])
-def test_a_step_that_nothing_determines_ends_the_refinement(middle_px):
-    # The start shows 10 px of the layout, 5 times as large: of the grid of 20 px on which a step is put
-    # together, none (130) or one (120) of the points is within twice the frame.
-    topography = gaussian_filter(np.random.default_rng(0).standard_normal((321, 321)), 2)
-    start = np.diag([5.0, 5.0, 1.0])
-    start[:2, 2] = 24 - 5 * middle_px
-    y, x = np.indices((48, 48))
-    scan = map_coordinates(topography, ((y - start[1, 2]) / 5 + 0.02, (x - start[0, 2]) / 5), order=3)
-    bend = Bend.none_yet(scan.shape)
-    ended = refine(scan, topography, start, "affine", bend=bend)
-    assert not ended.converged
-    assert ended.bend is bend
-    np.testing.assert_array_equal(ended.layout_to_scan, start)
 
 
 def test_resampling_looks_where_the_bend_says():

@@ -53,6 +53,7 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
     for one in action["object"]:
         raw = entities[one["@id"]]
         assert raw["identifier"] == f"sha256:{file_sha256(campaign / raw['name'])}"
+    assert action["startTime"] < action["endTime"]
     # RO-Crate 1.1 asks every root dataset for these.
     assert {"name", "description", "datePublished"} <= set(root)
 

@@ -144,7 +144,9 @@ def test_another_program_at_the_address_is_one_line_and_nothing_after(words: byt
         threading.Thread(target=answer, daemon=True).start()
         card = write_campaign(tmp_path, count=1)
         address = "tcp://{}:{}".format(*server.getsockname())
-        command = [sys.executable, "-c", "from litho_data.cli.app import main; main()", "build", str(card)]
+        program = "from litho_data.sharing import workers; workers._CONNECT_S = 0.5; "
+        program += "from litho_data.cli.app import main; main()"
+        command = [sys.executable, "-c", program, "build", str(card)]
         command += ["--out", str(tmp_path / "prints.zarr"), "--dask", address]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         for other in others:

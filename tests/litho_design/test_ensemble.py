@@ -133,6 +133,8 @@ def test_a_model_that_looks_at_the_whole_image_is_found_out():
     layout = LayoutSettings(size_px=256)
     level = torch.full((1, 1, 256, 256), 6.0)
     level[..., 100:104, 250:] = 12.0
+    # No height is none whatever it is divided by.
+    level[..., 40:60, :] = 0.0
     # Tiles away from the high corner normalise by half the height: 1 µm where the whole says 0.5 µm.
     check = Printer(Normalising(), layout, source="test").tiling_check(level, tile_px=64)
     assert check.max_nm == pytest.approx(500, rel=1e-5)

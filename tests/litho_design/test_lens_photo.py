@@ -21,11 +21,11 @@ from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredSource
 from litho_design.judging.photographs import score_lens_photo
 from litho_design.judging.score import ScoreResult
-from litho_design.lenses.bench import reconstruct, sensor_psf
+from litho_design.lenses.bench import sensor_psf
 from litho_design.lenses.objects import object_stack, read_object
 from litho_design.lenses.settings import lens_settings
 from litho_design.optics import Optics
-from litho_design.optics.imaging import Blur
+from litho_design.optics.imaging import Blur, richardson_lucy
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_lens
@@ -92,7 +92,7 @@ def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.0
 
 def estimate(loaded, recorded, psf, wanted):
     """What deconvolution makes of an image that needs no registration, at the scale of least error."""
-    found = reconstruct(recorded, psf, loaded.task.settings.imaging.iterations)
+    found = richardson_lucy(recorded, psf, loaded.task.settings.imaging.iterations)
     return found * matched_scale(found, wanted)
 
 

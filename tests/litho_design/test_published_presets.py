@@ -11,13 +11,13 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import hologram_settings
 from litho_design.large.lens import RadiusMap
-from litho_design.lenses.bench import reconstruct, record, sensor_psf
+from litho_design.lenses.bench import record, sensor_psf
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, lens_settings
 from litho_design.lenses.task import lens_task, strip_rings
+from litho_design.optics.imaging import richardson_lucy
 from litho_design.optimisation.parameters import CellMap, GumbelLevels, make_parametrisation
-from litho_design.optimisation.rate import lower_rate, rate_schedule
-from litho_design.optimisation.search import search_layout
+from litho_design.optimisation.search import lower_rate, rate_schedule, search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.workflows.design import design_lens
@@ -226,7 +226,7 @@ def test_smooth_l1_is_half_a_square_below_a_tenth(make_printer):
         found[loss] = float(task.loss(psf)[0])
     imaging, objects = settings.imaging, task.objects
     kernel = sensor_psf(psf, imaging.pixel_px)
-    error = (reconstruct(record(objects, kernel, imaging, seed=0), kernel, 3) - objects).abs().double()
+    error = (richardson_lucy(record(objects, kernel, imaging, seed=0), kernel, 3) - objects).abs().double()
     assert 0.1 < (error < 0.1).double().mean() < 0.9
     smooth = torch.where(error < 0.1, error.square() / 0.2, error - 0.05)
     # Means of 3072 numbers in float32.

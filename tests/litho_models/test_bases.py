@@ -95,7 +95,7 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
         # With a law in the model: its number is fitted too.
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1].vector)
-        maps.append(np.stack([HeldOut(closed, study).maps_um(state)[i] for i in out]))
+        maps.append(np.stack([HeldOut(closed).maps_um(state)[i] for i in out]))
     # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left; the
     # heights were changed by up to 0.2 µm.
     assert np.abs(maps[1] - maps[0]).max() < 1e-4

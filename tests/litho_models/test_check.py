@@ -29,7 +29,7 @@ from litho_models.monitoring.judging import DEFAULT_RATE, forecast, rates
 from litho_models.monitoring.prints import FIGURES, Check, print_values, spread_of
 from litho_models.scan_terms import POLICIES
 from litho_models.scan_terms.cross_fit import fitted_terms
-from litho_models.scoring.metrics import ScanFigures, scan_figures
+from litho_models.scoring.printer_state import ScanFigures, scan_figures
 from tests.litho_models.prints import make_scan, make_scans, printed_height_um, write_store
 
 GAIN = FIGURES[0]

@@ -104,7 +104,8 @@ def test_gradient_equals_finite_difference(effect: Effect) -> None:
             )
             # At its null an amplitude may be at a bound or a kink: one-sided, towards typical values.
             step = 1e-6 * (parameter.typical - parameter.null if at == parameter.off else parameter.typical)
-            step = step or 1e-6 * parameter.typical
+            # An angle has no typical size: a step of its range.
+            step = step or 1e-6 * (parameter.typical or parameter.upper - parameter.lower)
             up, here, down = (
                 float((weights * effect(array, {**typical, name: at + k * step}, context)).sum())
                 for k in (1, 0, -1)

@@ -122,7 +122,7 @@ def emptied(file):
 
 
 @pytest.mark.parametrize("damage", [cut_short, emptied])
-@pytest.mark.parametrize("name", ["state.json", "state.safetensors"])
+@pytest.mark.parametrize("name", ["state.json", "state.pt"])
 def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, store, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(trained[1], folder)

@@ -68,7 +68,7 @@ def test_the_limits_of_a_name_are_those_that_are_written(
     cause = Cause("slope-thinning", ALL, (), judge(np.full(10, 100.0), np.full(10, 90.0), study), 0.01, None)
     state = SimpleNamespace(
         freed_nm2=np.full(10, 90.0),
-        twin=SimpleNamespace(exhausts=lambda name: exhausted),
+        twin=SimpleNamespace(exhausts=lambda name: exhausted, slots=()),
         without=lambda name, study: SimpleNamespace(freed_nm2=np.full(10, 100.0)),
     )
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state, study: reshaped_nm2)

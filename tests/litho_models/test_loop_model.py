@@ -61,6 +61,7 @@ def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin) -> None:
         Slot(THINNING, "along_y_um", "1"),
         Slot(THINNING, "along_y_um", "2"),
         Slot(THINNING, "exponent", None),
+        Slot(THINNING, "turn_deg", None),
     )
     assert twin.own == 2
     assert twin.values({"field": "2"}) == {THINNING: thinning(0.2)}
@@ -86,7 +87,7 @@ def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> N
     plain = twin.ungrouped()
     assert plain.values({"field": "1"}) == plain.values({}) == twin.values({})
     assert plain.values({})[THINNING]["along_x_um"] == pytest.approx(0.15)
-    assert plain.vector == pytest.approx(np.r_[twin.vector[: twin.own], 0.15, 0.0, 1.0])
+    assert plain.vector == pytest.approx(np.r_[twin.vector[: twin.own], 0.15, 0.0, 1.0, 0.0])
     np.testing.assert_array_equal(plain.alone().vector, twin.vector[: twin.own])
 
 

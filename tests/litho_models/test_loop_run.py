@@ -381,7 +381,7 @@ def test_scans_of_different_sizes_are_taken_together(quick: None) -> None:
     scans = [replace(scan, id=f"S{number}", order=number) for number, scan in enumerate(single)]
     study = replace(study_of(scans, 2), scans=())
     found = close(scans, study.fold_of, base_model(), study)
-    rows = HeldOut(found, study).errors()
+    rows = HeldOut(found).errors()
     assert {tuple(row.by_scan_nm) for row in rows} == {tuple(scan.id for scan in scans)}
     assert np.isfinite([row.mae_nm for row in rows]).all()
 

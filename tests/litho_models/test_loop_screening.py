@@ -8,7 +8,8 @@ import pytest
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Effect, Parameter
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
+from litho_models.loop.screening import PERMUTATIONS, Screened, Screening
+from litho_models.loop.trials import Trial, trials_of
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
@@ -124,9 +125,10 @@ def _effect():
 
 
 def test_trials_of_one_shape_and_size_are_fitted_together() -> None:
-    sets = [trial.sets for trial in trials_of([_effect()])]
+    trials = trials_of([_effect()], 3)
     a, b, larger, bare = _effect().trials
-    assert sets == [(a, b), (larger,), (bare,)]
+    assert [one.sets for one in trials] == [(a, b), (larger,), (bare,)]
+    assert [one.columns for one in trials] == [[3, 4], [5], [6]]
 
 
 def test_multiples_count_from_the_null_and_stay_in_range() -> None:

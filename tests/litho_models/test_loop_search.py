@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from litho_models.effects import CATALOGUE, get_effect
+from litho_models.loop.closing import _in_model
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
 from litho_models.loop.model import Twin, Values
-from litho_models.loop.search import Found, same_change, search, separating, untestable
+from litho_models.loop.search import Found, describe, same_change, search, separating, untestable
 from litho_models.models import build_model
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
@@ -60,6 +61,28 @@ def test_a_cause_in_all_scans_is_found_with_one_strength() -> None:
     assert found.causes[0].group_p is None
     assert found.causes[0].family_p <= 0.05
     assert found.causes[0].judgement.improved == (10, 10)
+
+
+def test_a_loss_along_a_diagonal_is_the_cause_with_its_direction() -> None:
+    found = found_in((THINNING, ALL, {"": {**thinning(0.2), "turn_deg": 35.0}}))
+    assert added(found) == {THINNING: ALL}
+    values = found.state.twin.values({})[THINNING]
+    # A frame that is turned by 35 degrees is also one turned by -55, with its axes exchanged.
+    assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
+    assert values["turn_deg"] == pytest.approx(35, abs=3)
+
+
+def test_what_only_a_table_describes_enters_the_corrected_model() -> None:
+    table = get_effect("level-table")
+    strengths = {name: 0.03 * (-1) ** number for number, name in enumerate(table.amplitudes)}
+    study = study_of(planted([("level-table", ALL, {"": strengths})]))
+    state = bare_state(study)
+    found = _in_model(state, describe(state, study, [table], 1), study)
+    assert found.names == ["level-table"]
+    assert state.mse_nm2 > 2 * found.state.mse_nm2
+    # All that is left is the noise.
+    assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
+    assert _in_model(state, [], study).state is state
 
 
 def test_two_causes_are_found_together_each_with_its_grouping() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from scipy.stats import t as student
 
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
+from litho_models.cli.noise import noise
+from litho_models.noise.analyse import analyse_noise_of_files
 from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import analyse_spread, conformal_factor
 from litho_models.noise.dose import dose_matrix
@@ -682,6 +685,12 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
         mae_nm = np.mean(np.abs(found.residuals_nm))
         assert mae_nm == pytest.approx(scores.mae_datum_free_nm, rel=1e-6)
         assert mae_nm < 0.8 * scores.without_background[1].mae_nm
+
+
+def test_the_command_and_its_function_have_one_default():
+    of_files, command = (signature(one).parameters for one in (analyse_noise_of_files, noise))
+    for name in ("level_height_um", "unit", "size_um", "steps", "substrate"):
+        assert of_files[name].default == command[name].default
 
 
 @pytest.mark.pictures

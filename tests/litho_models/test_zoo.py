@@ -23,9 +23,8 @@ from litho_models.evaluation.results import Benchmark
 from litho_models.frozen import zoo
 from litho_models.frozen.card import OUT_OF_FOLD, TRAINED_ON, ModelCard
 from litho_models.frozen.on_store import predict_frozen
-from litho_models.frozen.readme import model_readme
 from litho_models.models import build_model
-from litho_models.scoring.metrics import scan_figures
+from litho_models.scoring.printer_state import scan_figures
 from tests.litho_models.prints import make_scans, write_store
 
 SMALL = {
@@ -77,7 +76,7 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
     card = ModelCard.read(zoo.folder(name))
     assert card.command == f"litho-models train neural-lithography.zarr --model={name} --out={name}"
     page = (zoo.folder(name) / "README.md").read_text(encoding="utf-8")
-    assert page == model_readme(card)
+    assert page == card.page
     # Before all else that it says of the model.
     assert page.index(card.held_out.text) < page.index("## Use")
 

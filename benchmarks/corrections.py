@@ -1,0 +1,204 @@
+"""Does `litho-design correct` bring prints closer to reliefs, by judges that took no part in it?
+
+    python -m benchmarks.corrections --out runs/corrections [--publish]
+
+Five reliefs, printed by three virtual fabs with the effects of the design gap, which no model has, and by a
+model of the zoo. Physics and the blur with a table correct: for a fab trained on scans of its prints, for the
+measured prints those of the zoo, which PBL judges. Beside each correction stand the two layouts that need
+none: nominal heights, and the best gain and zero, chosen by the models of the search and, as nobody can
+before the print, by the judge itself. An interrupted run resumes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.gap.plan import PRINT_KNOBS, SCAN_KNOBS
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import conclude, options, origin, write_record
+from litho_data import build_dataset, simulate
+from litho_data.commands.progress import run_script
+from litho_design import Task, correct, load_design
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import load_printer
+from litho_design.reliefs.settings import ReliefSettings, relief_settings
+from litho_design.reliefs.targets import load_relief
+from litho_design.reliefs.task import ReliefTask
+from litho_models import freeze, train
+
+PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
+RESULT = PAGE.parent / "results" / "corrections" / "corrections.json"
+NAME = "corrections"
+RELIEFS = ("cap", "freeform", "blaze", "staircase", "lens")
+# Announced before any of these fabs had printed.
+SEEDS = (72, 73, 74)
+FAB_MODELS, ZOO_MODELS, ZOO_JUDGE = ("physics", "blur-table"), ("zoo:physics", "zoo:blur-table"), "zoo:pbl"
+SCANS, SCAN_PX, SIZE_PX, POLISH = 6, 128, 128, 40
+COLUMNS = {
+    "uncorrected": "nominal",
+    "best affine": "best affine, by the models",
+    "affine by the judge": "by the judge",
+    "corrected": "corrected",
+}
+ALLOWED = 1.05
+
+
+def main() -> None:
+    """Make what is missing, print, write."""
+    given = _arguments()
+    torch.set_num_threads(1)
+    settings = relief_settings({"layout.size_px": given.size, "search.polish_rounds": POLISH})
+    rows = []
+    for seed, models, judge in _printers(given.out, settings):
+        for relief in RELIEFS:
+            place = given.out / f"{judge.name}-{seed}" / relief
+            kept = place.with_suffix(".json")
+            if not kept.is_file():
+                write_record(kept, corrected(relief, seed, models, judge, place, settings))
+            rows.append(json.loads(kept.read_text(encoding="utf-8")))
+    record = {
+        "schema": "litho-design/benchmark-corrections/1",
+        "size_px": given.size,
+        **origin(),
+        "rows": rows,
+    }
+    out = RESULT if given.publish else given.out / f"{NAME}.json"
+    conclude(record, as_markdown(record), out, PAGE, NAME, published=given.publish)
+
+
+def corrected(
+    relief: str, seed: int, models: Sequence[Printer], judge: Printer, out: Path, settings: ReliefSettings
+) -> dict[str, Any]:
+    """One correction, and what the judge prints of it and of the layouts that need none, rms nm."""
+    wanted = wanted_um(relief, seed, settings)
+    made = correct(wanted, models[0], out, settings=settings, judges=models[1:], announce=False)
+    inputs = {"relief_um": wanted}
+    layouts = _Plain(settings, models[0], inputs=inputs, ensemble=models[1:]).untouched()
+    judging = _Plain(settings, judge, inputs=inputs)
+    layouts["affine by the judge"] = judging.untouched()["best affine"]
+    layouts["corrected"] = load_design(out).level
+    assert made.width is not None
+    return {
+        "relief": relief,
+        "seed": seed,
+        "judge": judge.name,
+        "returned": made.width.returned,
+        "stated_nm": made.predicted["rms_nm"],
+        "between_nm": list(made.width.between),
+        "printed_nm": {name: _rms_nm(judging, layouts[name]) for name in COLUMNS},
+    }
+
+
+def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
+    """Heights (size, size), µm, of a relief; the freeform surface is drawn from the seed."""
+    layout, high_um = settings.layout, settings.height_um
+    if name in ("cap", "blaze", "staircase"):
+        return load_relief("lens" if name == "cap" else name, layout, high_um)[0]
+    place = (np.arange(layout.size_px) + 0.5) / layout.size_px - 0.5
+    y, x = np.meshgrid(place, place, indexing="ij")
+    if name == "lens":
+        # Four zones of a Fresnel lens.
+        surface = -16 * (x**2 + y**2) % 1
+    else:
+        order, draw = np.arange(4), np.random.default_rng(seed)
+        size = draw.normal(size=(4, 4)) / (1 + order[:, None] ** 2 + order**2)
+        turn = draw.uniform(0, 2 * np.pi, (4, 4))
+        y, x = y[..., None, None], x[..., None, None]
+        waves = np.cos(2 * np.pi * (order[:, None] * y + order * x) + turn)
+        surface = (size * waves).sum((-2, -1))
+        surface = (surface - surface.min()) / np.ptp(surface)
+    return (high_um * surface).astype(np.float32)
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """What it comes to, and one line for each relief and printer."""
+    rows = record["rows"]
+    lines = [
+        (
+            row["relief"],
+            f"{row['judge']} {row['seed']}",
+            *(f"{row['printed_nm'][name]:.1f}" for name in COLUMNS),
+            "{:.0f} … {:.0f}".format(*row["between_nm"]),
+        )
+        for row in rows
+    ]
+    heads = ("relief", "printed by", *COLUMNS.values(), "to be expected")
+    note = f"rms error of the print, its offset free, nm; reliefs 0.6 µm high on {record['size_px']} px."
+    return f"{summary(rows)}\n\n{markdown_table(heads, lines, note)}"
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How often the correction is no worse than doing nothing, and how often its width holds the print."""
+    worse = [row for row in rows if over_idle(row) > ALLOWED]
+    inside = [row for row in rows if holds(row)]
+    blazes = [over_idle(row, ("best affine",)) for row in rows if row["relief"] == "blaze"]
+    listed = [f"{row['relief']} by {row['judge']} {row['seed']} {over_idle(row):.2f} ×" for row in worse]
+    named = f" ({', '.join(listed)})" if listed else ""
+    median = np.median([over_idle(row) for row in rows])
+    return (
+        f"Of {len(rows)} corrections {len(worse)} print more than 5 % worse than the better of nominal "
+        f"heights and best affine{named}. In the median a correction has {median:.2f} × the error of that, "
+        f"and a blaze {np.median(blazes):.2f} × that of the best affine. {len(inside)} of {len(rows)} prints "
+        "lie within the stated width."
+    )
+
+
+def holds(row: Mapping[str, Any]) -> bool:
+    """Whether the error of the print lies where the design said."""
+    low, high = row["between_nm"]
+    return bool(low <= row["printed_nm"]["corrected"] <= high)
+
+
+def over_idle(row: Mapping[str, Any], idle: Sequence[str] = ("uncorrected", "best affine")) -> float:
+    """Error of a correction over that of the better of these layouts that need none, by the judge."""
+    printed = row["printed_nm"]
+    return float(printed["corrected"] / min(printed[name] for name in idle))
+
+
+def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[Printer], Printer]]:
+    """Seed, models of a printer, and who prints; what lies in the folder is not made again."""
+    for seed in SEEDS:
+        folder = out / f"fab-{seed}"
+        store = folder / "prints.zarr"
+        if not store.exists():
+            knobs = [f"{name}={value}" for name, value in (PRINT_KNOBS | SCAN_KNOBS).items()]
+            build_dataset(
+                simulate(folder / "fab", count=SCANS, size_px=SCAN_PX, seed=seed, knobs=knobs), store
+            )
+        for name in FAB_MODELS:
+            if not (folder / name / "card.json").exists():
+                train(store, name, folder / f"run-{name}")
+                freeze(folder / f"run-{name}", folder / name)
+        models = [load_printer(folder / name, settings.layout) for name in FAB_MODELS]
+        yield seed, models, load_printer(folder / "fab" / "truth", settings.layout, name="fab")
+    models = [load_printer(source, settings.layout) for source in ZOO_MODELS]
+    yield 0, models, load_printer(ZOO_JUDGE, settings.layout)
+
+
+class _Plain(ReliefTask):
+    """Affine layouts of the least rms error, whatever errors the models have of their own."""
+
+    loss_by = Task.loss_by
+
+
+@torch.no_grad()
+def _rms_nm(task: ReliefTask, level: torch.Tensor) -> float:
+    return task.figures(task.printed_um(level))["rms_nm"]
+
+
+def _arguments() -> argparse.Namespace:
+    parser = options(__doc__, "write record and table into docs")
+    parser.add_argument("--out", type=Path, required=True, help="folder of fabs, models and designs")
+    parser.add_argument("--size", type=int, default=SIZE_PX, help="side of the reliefs, pixels")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,37 @@
+"""Results in words, from templates: verdicts, how errors were made, and what limits them."""
+
+from pathlib import Path
+
+from litho_data.reports.page import filled
+from litho_models.evaluation.results import Benchmark, Evaluation
+from litho_models.scoring.records import ModelScores
+
+# What counts as more than chance: an interval without zero, and sign flips of the independent units below.
+_CHANCE = 0.05
+
+
+def benchmark_verdict(result: Benchmark) -> str:
+    """Which model predicts best, by how much, whether that is more than chance, and what noise leaves.
+
+    A difference is judged over prints where there are several.
+    """
+    best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
+    assert best is not None
+    names = {best.model, second and second.model}
+    pair = next((one for one in result.paired if {one.first, one.second} == names), None)
+    return _verdict(result, best, second=second, pair=pair, chance=_CHANCE)
+
+
+def evaluation_verdict(result: Evaluation) -> str:
+    """How far the model is off on scans, what of it the zero height is, and what noise leaves."""
+    return _verdict(result, result.scores)
+
+
+def _verdict(result: Benchmark | Evaluation, best: ModelScores, **more: object) -> str:
+    least = result.noise_floor.mae_at(result.nuisance.policy)
+    return " ".join(said("verdict", result=result, best=best, least=least, **more))
+
+
+def said(name: str, **values: object) -> list[str]:
+    """The lines of a template: ``verdict``, ``protocol``, ``notes`` or ``paper``."""
+    return filled(Path(__file__).with_name(f"{name}.jinja"), **values).splitlines()

@@ -1,0 +1,131 @@
+"""What is tried of a candidate: sets of its parameters, and what they change in the scans."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from litho_models.effects import Effect, get_effect
+from litho_models.loop.fits import ALL_FREE
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan
+
+_Key = tuple[str, tuple[tuple[str, float], ...]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Parameter sets of one effect of one shape and size; their amplitudes are fitted together.
+
+    ``columns``: where its changes stand among all that are looked at.
+    """
+
+    effect: Effect
+    sets: tuple[Mapping[str, float], ...]
+    columns: list[int] = field(default_factory=list)
+
+    @cached_property
+    def _facts(self) -> np.ndarray:
+        """Of each amplitude null, lowest and highest value, and distance of an ordinary one from the null."""
+        facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
+        return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
+
+    def steps(self, multiples: np.ndarray) -> np.ndarray:
+        """How far these multiples of the sets take each amplitude (amplitudes,) from its null."""
+        return multiples @ _steps(self.effect, self.sets)
+
+    def sizes(self, multiples: np.ndarray) -> np.ndarray:
+        """The same without signs, in those of ordinary values."""
+        return np.abs(self.steps(multiples)) / self._facts[3]
+
+    def allowed(self, multiples: np.ndarray, largest: float = 0.0) -> bool:
+        """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there.
+
+        Noise is what is small beside the largest amplitude, or beside ``largest``, that of any group.
+        """
+        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
+        wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
+        sizes = self.sizes(multiples)
+        return not (sizes[wrong] > 0.3 * max(largest, sizes.max())).any()
+
+    def reach(self, multiples: np.ndarray) -> float:
+        """Share of the step that stays within the ranges: a straight line from the null overshoots."""
+        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
+        room = np.where(steps > 0, upper, lower) - null
+        beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
+        return float(np.min(room[beyond] / steps[beyond], initial=1.0))
+
+    def start(self, multiples: np.ndarray) -> dict[str, float]:
+        """Values from which a fit begins, no farther from the null than the largest trial."""
+        null, lower, upper, _ = self._facts
+        largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
+        steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
+        values = np.clip(null + steps, lower, upper).tolist()
+        amplitudes = dict(zip(self.effect.amplitudes, values, strict=True))
+        return {**self.effect.off_values(), **self.sets[0], **amplitudes}
+
+
+def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
+    """How far each set takes each amplitude from its null, (sets, amplitudes)."""
+    nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
+    return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
+
+
+def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
+    """The trials of the effects by shape and size, their columns from the first one on.
+
+    A second trial of the same amplitudes at the same shape is another size: what an effect does when it is
+    large need not be a multiple of what it does when it is small.
+    """
+    found: list[Trial] = []
+    for effect in effects:
+        sizes: Counter[object] = Counter()
+        together: dict[object, list[Mapping[str, float]]] = {}
+        for trial in effect.trials:
+            shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
+            alike = shape, frozenset(trial)
+            together.setdefault((shape, sizes[alike]), []).append(trial)
+            sizes[alike] += 1
+        for own in together.values():
+            found.append(Trial(effect, tuple(own), list(range(first, first + len(own)))))
+            first += len(own)
+    return found
+
+
+class Secants:
+    """What trials change in the windows at a model; what is known of one is not computed again."""
+
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
+        self._placed, self._windows = twin.placed(), windows
+        self._known: dict[_Key, list[NDArray[np.float32]]] = {}
+
+    def learn(self, trials: Sequence[Trial]) -> None:
+        """Compute what is not known yet."""
+        new = [key for key in _keys(trials) if key not in self._known]
+        self._known |= {key: [] for key in new}
+        for window in self._windows if new else ():
+            base = self._placed.base_height(self._placed.exposed(window), window)
+            here = self._placed.height(window, base_um=base)
+            for name, values in new:
+                effect = get_effect(name)
+                known = base if effect.acts_on == "height" else None
+                moved = self._placed.height(window, {name: effect.with_values(dict(values))}, known)
+                self._known[name, values].append(window.at_sample(moved - here).astype(np.float32))
+
+    def of(self, trials: Sequence[Trial], number: int) -> list[NDArray[np.float32]]:
+        """Changes (n,), µm, in one window, a row for each set of each trial."""
+        return [self._known[key][number] for key in _keys(trials)]
+
+    def free_terms(self, number: int) -> np.ndarray:
+        """Orthonormal basis (n, k) of what one window may add by itself."""
+        window = self._windows[number]
+        return window.free_basis(self._placed.height(window), ALL_FREE)
+
+
+def _keys(trials: Sequence[Trial]) -> list[_Key]:
+    return [(trial.effect.name, tuple(values.items())) for trial in trials for values in trial.sets]

@@ -1,0 +1,92 @@
+"""What one scan says of the state of the printer: gain, error, and of what layout they are."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan
+from litho_models.scan_terms import POLICIES, Blocks, cross_fit
+from litho_models.scan_terms.cross_fit import fitted_terms
+from litho_models.scoring.metrics import print_gain
+
+_SURFACE = frozenset({"offset", "bow"})
+
+
+class ScanFigures(Record):
+    """Figures of one scan against a model, both free of the scan's offset, tilt and bow.
+
+    ``gain``: measured over predicted height, with its standard error (of blocks, see ``print_gain``; None for
+    a single block). ``error_nm``: mean absolute error with the gain free too (policy ``full``, k = 7), terms
+    fitted on other pixels. ``order``: of printing. ``relief_nm``: standard deviation of the predicted height,
+    and ``steepness`` its rms slope, which tell layouts of one kind from others. ``held_out``: whether the
+    prediction is of a model that had not seen the scan.
+    """
+
+    scan: str
+    print: str
+    order: int
+    gain: float
+    gain_error: float | None
+    error_nm: float
+    pixels: int
+    relief_nm: float
+    steepness: float
+    dose: float | None = None
+    held_out: bool = True
+
+
+def scan_figures(
+    scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
+) -> ScanFigures | None:
+    """Figures of a scan; None where the layout is flat, so that there is no gain.
+
+    Offset, tilt and bow are taken out of height and prediction alike, which gives the gain that a joint fit
+    of all terms would (Frisch and Waugh 1933).
+
+    Args:
+        scan: the scan; ``prediction_um``: what the model expects of it, (ny, nx) µm.
+        held_out: whether the model had not seen it.
+
+    Raises:
+        InputError: what ``cross_fit`` refuses.
+    """
+    blocks = Blocks()
+    residual = cross_fit(scan.height_um, prediction_um, scan.valid, POLICIES["full"], blocks).residual_um
+    used = np.isfinite(residual)
+    level = np.zeros(scan.shape)
+    height, expected = (
+        np.asarray(part, np.float64) - fitted_terms(part, level, used, _SURFACE)[1]
+        for part in (scan.height_um, prediction_um)
+    )
+    line = print_gain(height, expected, used, block_px=blocks.block_px)
+    if np.ptp(scan.mask_level) == 0 or not np.isfinite(line.slope):
+        return None
+    return ScanFigures(
+        scan=scan.id,
+        print=scan.print_id,
+        order=scan.order,
+        gain=line.slope,
+        gain_error=line.slope_error if np.isfinite(line.slope_error) else None,
+        error_nm=NM_PER_UM * float(np.abs(residual[used]).mean()),
+        pixels=int(used.sum()),
+        relief_nm=NM_PER_UM * float(expected[used].std()),
+        steepness=float(np.sqrt(sum(np.mean(part**2) for part in np.gradient(expected, scan.pitch_um)))),
+        dose=scan.dose,
+        held_out=held_out,
+    )
+
+
+def baseline_of(
+    scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
+) -> list[dict[str, Any]]:
+    """Figures of the scans that a model was made of, for its card; none where fields are too small."""
+    pairs = zip(scans, predictions_um, strict=True)
+    try:
+        rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]
+    except InputError:
+        return []
+    return [row.model_dump(mode="json") for row in rows if row is not None]
