@@ -39,12 +39,7 @@ if TYPE_CHECKING:
 PAGE = Path(__file__).parents[1] / "docs" / "second_machine.md"
 RESULT = PAGE.parent / "results" / "second-machine" / "second_machine.json"
 BASELINES = ("identity", "affine", "blur-table")
-BARE = {"spots": 1, "resist": "threshold", "diffusion": False, "etch_bias": False}
-PARTS: dict[str, dict[str, Any]] = {
-    "backscatter": {"spots": 2},
-    "diffusion": {"resist": "hill", "diffusion": True},
-    "etch bias": {"etch_bias": True},
-}
+PARTS = ("backscatter", "diffusion", "etch bias")
 BASE = "spot and threshold"
 WHOLE = " + ".join((BASE, *PARTS))
 # A printer of few numbers needs no more patterns than every second; each gives a window of 256 px.
@@ -131,7 +126,7 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
         model = fit_with_record(name, fold.training, config).model
     else:
         fits = []
-        for start in ({}, bare) if bare else ({},):
+        for start in ({}, started(fields["parts"], bare)) if bare else ({},):
             model = build_model("e-beam" if printer else name, **{**fields, **start}, **geometry)
             losses = fit_small_model(model, fold.training[::FITTED_EVERY], "none")
             fits.append((losses[-1] if losses else 0.0, model))
@@ -141,17 +136,23 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
 
 
 def fields_of(name: str) -> dict[str, Any]:
-    """What makes a printer of the parts in its name."""
-    return BARE | {key: value for part in name.split(" + ")[1:] for key, value in PARTS[part].items()}
+    """What makes a printer of the parts in its name: stages, where the spot starts, what is not fitted."""
+    added = name.split(" + ")[1:]
+    spot = "two-spots" if "backscatter" in added else "spot"
+    resist = ("hill", "diffusion") if "diffusion" in added else ()
+    fixed = [*(["etch.threshold"] if resist else []), *([] if "etch bias" in added else ["etch.bias_px"])]
+    return {"parts": (spot, *resist, "etch"), f"{spot}.sigma_um": 0.02, "fixed": fixed}
 
 
-def held_out_print(name: str, values: Mapping[str, float], scan: PrintedScan) -> np.ndarray:
+def started(parts: Sequence[str], bare: Mapping[str, float]) -> dict[str, float]:
+    """Where a printer of these parts starts that begins as the bare one ended."""
+    threshold = "hill" if "hill" in parts else "etch"
+    return {f"{parts[0]}.sigma_um": bare["spot.sigma_um"], f"{threshold}.threshold": bare["etch.threshold"]}
+
+
+def held_out_print(name: str, values: Mapping[str, Any], scan: PrintedScan) -> np.ndarray:
     """The film (ny, nx), µm, that a printer of these fitted values expects of a pattern."""
-    starts: dict[str, Any] = {key: value for key, value in values.items() if key != "bias_um"}
-    model = build_model("e-beam", **fields_of(name), **starts, **common_geometry([scan]))
-    if "bias_um" in values:
-        model.raw_bias_um.data = model.ranges["raw_bias_um"].raw(values["bias_um"])
-    return predict_scan(model, scan)
+    return predict_scan(build_model("e-beam", **fields_of(name), **values, **common_geometry([scan])), scan)
 
 
 def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:

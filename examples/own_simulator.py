@@ -3,7 +3,8 @@
     python examples/own_simulator.py STORE.zarr --out FOLDER
 
 Registers a printer whose line is two Gaussians, then trains it as `litho-models train` does. Nothing else has
-to change: benchmark, loop and design take it by its name, in every process that imports this file.
+to change: benchmark, loop and design take it by its name. In a plug-in (docs/extending.md) the class is
+registered where it stands, by `@register_simulator`; then all commands know it.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from litho_data.foundation.faces import lazy_face
 if TYPE_CHECKING:
     from litho_data.cards.fetch import fetch as fetch
     from litho_data.foundation.errors import InputError as InputError
+    from litho_data.foundation.plugins import load_plugins as load_plugins
     from litho_data.level.recipe import Recipe as Recipe
     from litho_data.level.scan import level_scan as level_scan
     from litho_data.making.build import build_dataset as build_dataset

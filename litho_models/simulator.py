@@ -60,6 +60,7 @@ class SimulatorConfig(BaseModel):
     pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
     level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
     levels: int = Field(13, ge=2, le=65536, description="number of layout levels, 0 included")
+    fixed: tuple[str, ...] = Field((), description="numbers that no fit changes, by their names in ranges")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
@@ -101,6 +102,13 @@ class Simulator(nn.Module, ABC):
     def __init__(self, config: SimulatorConfig):
         super().__init__()
         self.config = config
+
+    def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
+        """As of every module; what the config fixes is not trained."""
+        known = self.ranges[name].name if name in self.ranges else name
+        if param is not None and known in self.config.fixed:
+            param.requires_grad_(False)
+        super().register_parameter(name, param)
 
     @property
     @abstractmethod

@@ -20,7 +20,7 @@ PACKAGES = ("litho_data", "litho_models", "litho_design")
 # Rooms whose `__all__` is for other rooms and on no page.
 INNER = {"litho_models.fitting"}
 # Of every command by itself, and of torchrun.
-ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python"}
+ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python", "--plugin"}
 
 
 def entries() -> list[dict[str, Any]]:

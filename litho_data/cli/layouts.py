@@ -79,7 +79,9 @@ def simulate(
         Path,
         option("folder to write (raw/ and truth/); an older run of these settings is replaced"),
     ],
-    preset: Annotated[str, option("plain, demo, measured-like or second-printer")] = "plain",
+    preset: Annotated[
+        str, option("plain, demo, measured-like or second-printer; of films: e-beam or projection")
+    ] = "plain",
     layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
     plan: Annotated[
         Path | None,
@@ -119,6 +121,12 @@ def simulate(
     """
     from litho_data.foundation.errors import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate, simulate_plan
+    from litho_data.virtual_fab.films import (
+        FILM_PRINTERS,
+        FilmTruth,
+        film_knobs,
+        simulate_films,
+    )
     from litho_data.virtual_fab.settings import preset as named_preset
 
     if (plan is None) != (fab is None):
@@ -137,6 +145,11 @@ def simulate(
     if layouts is not None and any(value is not None for value in (count, size_px, write_field_um)):
         wanted = "no --count, --size-px or --write-field-um: the card's layouts have them"
         raise InputError("options beside --layouts", wanted=wanted)
+    if preset in FILM_PRINTERS:
+        knobs = film_knobs(knob or ())
+        card = simulate_films(out, preset, count=count or 12, size_px=size_px or 256, seed=seed, knobs=knobs)
+        typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / FilmTruth.FILE_NAME}")
+        return
     chosen = named_preset(preset)
     printer = chosen.printer
     if stitch_field_um is not None:

@@ -14,6 +14,7 @@ import typer
 
 from litho_data.commands.progress import command_line, given_words
 from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.plugins import OPTION, load_plugins, without_plugins
 from litho_data.foundation.run_facts import running_command
 
 # Typer does not export it under a name of its own: what its errors of usage are derived from.
@@ -111,6 +112,11 @@ def new_app(help_text: str) -> typer.Typer:
     def options(
         context: typer.Context,
         version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+        # Taken off the words by run_app, before there is anything to parse: here for the help.
+        plugin: Annotated[
+            list[str] | None,
+            option("Load a Python file that registers something; goes with every command.", OPTION),
+        ] = None,
     ) -> None:
         if version:
             from litho_data import __version__
@@ -143,7 +149,9 @@ def run_app(app: typer.Typer, name: str) -> None:
             stream.reconfigure(errors="replace")
     try:
         with running_command(command_line(name)):
-            code = app(prog_name=name, standalone_mode=False)
+            words, files = without_plugins(given_words())
+            load_plugins(files)
+            code = app(words, prog_name=name, standalone_mode=False)
     except BrokenPipeError:
         # Who read the output, such as `head`, has had enough; Python would complain when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from litho_data.foundation.plugins import plugin_versions
 from litho_data.foundation.results import Record
 
 _PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
@@ -63,9 +64,14 @@ def running_command(command: str) -> Iterator[None]:
         _COMMAND.reset(token)
 
 
-@cache
 def software_record() -> dict[str, Any]:
-    """Which software runs: ``versions`` of packages and BLAS, ``commit`` and ``dirty`` of the checkout."""
+    """Which software runs: ``versions`` of packages, BLAS and plug-ins, ``commit`` and ``dirty`` state."""
+    software = _software()
+    return {**software, "versions": {**software["versions"], **plugin_versions()}}
+
+
+@cache
+def _software() -> dict[str, Any]:
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
     versions = {"python": platform.python_version(), "platform": sys.platform}
     for name in _PACKAGES:

@@ -36,8 +36,8 @@ def formats() -> tuple[str, ...]:
 def register_reader(reader: Reader) -> Reader:
     """Read files of another format from now on; a new reader is asked before the existing ones.
 
-    To build in several processes, call this in a module that every process imports, such as the script that
-    starts the build, at its top level.
+    To build in several processes, call this in a plug-in, or in the script that starts the build, at its top
+    level.
 
     Raises:
         InputError: there is a format of that name.

@@ -5,13 +5,14 @@ import ctypes
 import os
 import pickle
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from io import BytesIO
 from typing import Any
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 
 # Of mallopt(3), with the values that the C library arrives at by itself where nobody sets one.
@@ -34,16 +35,18 @@ class Known:
 class Away:
     """A function as another process runs it: in the same folder, for results with the same command line.
 
-    ``software``: what a Dask worker has to run too.
+    ``plugins``: files of plug-ins to load first; ``software``: what a Dask worker has to run too.
     """
 
     function: Callable[[Any], Any]
     make: bytes
     folder: str
     command: str
+    plugins: Sequence[str]
     software: Mapping[str, Any] | None
 
     def __call__(self, job: bytes) -> bytes:
+        load_plugins(self.plugins)
         if self.software is not None:
             _require_alike(self.software, self.folder)
             _keep_freed_memory()

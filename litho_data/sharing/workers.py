@@ -23,6 +23,7 @@ from itertools import islice
 from typing import NamedTuple, TypeVar
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.plugins import plugin_files
 from litho_data.foundation.run_facts import run_facts, software_record
 from litho_data.sharing.sending import Away, Known, received, sent
 
@@ -106,7 +107,8 @@ def run_jobs(
     known = workers.known or Known(dict, {})
     names = {id(one): key for key, one in known.objects.items()}
     software = software_record() if workers.dask else None
-    away = Away(function, pickle.dumps(known.make), os.getcwd(), run_facts()["command"], software)
+    made = pickle.dumps(known.make)
+    away = Away(function, made, os.getcwd(), run_facts()["command"], plugin_files(), software)
     with nullcontext(workers.pool) if workers.pool else _opened(workers, apart, len(jobs)) as pool:
         for number, answer in _tried(
             lambda one: pool.submit(away, sent(jobs[one], names)),

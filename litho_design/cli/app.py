@@ -112,13 +112,6 @@ def score(
             help="sd along each axis by which each of them lies off its place, µm", min=0, hidden=True
         ),
     ] = 0.0,
-    task_file: Annotated[
-        Path | None,
-        typer.Option(
-            help="file in Python that registers the task of the design, one of your own; it is run",
-            hidden=True,
-        ),
-    ] = None,
     stream: Annotated[
         bool,
         typer.Option("--stream", help="large hologram: printed and scored band by band"),
@@ -133,7 +126,6 @@ def score(
     """
     from litho_design.images.photograph import PhotoSource
     from litho_design.optimisation.stitching import Stitching
-    from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
     stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
@@ -143,8 +135,6 @@ def score(
         )
     if camera is None and camera_object is not None:
         raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
-    if task_file is not None:
-        register_tasks_of(task_file)
     photo = None
     if camera is not None:
         photo = PhotoSource(

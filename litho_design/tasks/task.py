@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import inspect
-import sys
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -351,34 +349,9 @@ def registered_task(name: str) -> type[Task]:
             "task",
             name,
             sorted(_TASKS),
-            also="one of your own, made known by register_task (--task-file names its file)",
+            also="one of your own, made known by register_task (--plugin names its file)",
         )
     return _TASKS[name]
-
-
-def register_tasks_of(file: str | Path) -> None:
-    """Run a Python file that registers tasks, as a command does that opens designs of them.
-
-    Raises:
-        InputError: not a file of Python, one that fails, or one that registers nothing.
-    """
-    path = Path(file)
-    name = path.stem
-    spec = importlib.util.spec_from_file_location(name, path) if path.is_file() else None
-    if spec is None or spec.loader is None:
-        raise InputError("task file", got=str(path), wanted="a file of Python that calls register_task")
-    module = importlib.util.module_from_spec(spec)
-    before = dict(_TASKS)
-    # Known by name, so that the code of the task can be read; never in place of another module.
-    sys.modules.setdefault(name, module)
-    try:
-        spec.loader.exec_module(module)
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"task file {path}", got=f"{type(error).__name__}: {error}") from error
-    if before == _TASKS:
-        raise InputError(f"task file {path}", got="no task", wanted="a class passed to register_task")
 
 
 def _source(task: type) -> str:

@@ -21,7 +21,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.paper import with_paper_copies
 from litho_models.cli.board import board
-from litho_models.cli.loop import check, close_loop, next_print
+from litho_models.cli.loop import FixOption, FreeOption, check, close_loop, next_print
 from litho_models.cli.noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
@@ -66,7 +66,10 @@ PrecisionOption = Annotated[
 Seed = Annotated[int, option("of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
-    option("FIELD=VALUE of the training, such as learning_rate=0.001; repeatable", "--set"),
+    option(
+        "FIELD=VALUE of training or model, such as learning_rate=0.001 or spot.sigma_um=0.3; repeatable",
+        "--set",
+    ),
 ]
 
 
@@ -78,7 +81,7 @@ def train(
         str,
         option(
             "identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
-            "e-beam, pbl or fno"
+            "e-beam, projection, laser-writer, dmd-grayscale, pbl or fno"
         ),
     ],
     out: Out,
@@ -88,6 +91,8 @@ def train(
     precision: PrecisionOption = None,
     seed: Seed = 0,
     set_: SetOption = None,
+    fix: FixOption = None,
+    free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
         option("train on the locked scans too; nothing is left to judge by", "--use-lock-box"),
@@ -98,8 +103,11 @@ def train(
     Example: litho-models train prints.zarr --model pbl --out run
     """
     from litho_models.frozen.card import bounds_text
+    from litho_models.models import fixed_numbers
 
     settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
+    if fix or free:
+        settings["fixed"] = fixed_numbers(model, fix or (), free or ())
     run = litho_models.train(
         store, model, out, recipe=settings.pop("recipe"), settings=settings, use_lock_box=use_lock_box
     )

@@ -7,7 +7,15 @@ import typer
 
 import litho_models
 from litho_data.commands.app import DaskOption, WorkersOption, argument, option
+from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
+
+FixOption = Annotated[
+    list[str] | None, option("a number of the model that no fit changes, such as eta; repeatable", "--fix")
+]
+FreeOption = Annotated[
+    list[str] | None, option("a number that is fitted though usually it is not; repeatable", "--free")
+]
 
 
 @with_paper_copies
@@ -24,6 +32,12 @@ def close_loop(
         str,
         option("model to correct: its name, a frozen one (a folder, zoo:NAME), or auto: the best"),
     ] = "auto",
+    set_: Annotated[
+        list[str] | None,
+        option("FIELD=VALUE of a small base, such as spot.sigma_um=0.3; repeatable", "--set"),
+    ] = None,
+    fix: FixOption = None,
+    free: FreeOption = None,
     folds: Annotated[int, option("by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
@@ -50,12 +64,17 @@ def close_loop(
     Example: litho-models close-loop prints.zarr --out loop
     """
     from litho_models.loop.report import said
+    from litho_models.models import fixed_numbers
 
+    settings = assigned(set_ or ())
+    if fix or free:
+        settings["fixed"] = fixed_numbers(base, fix or (), free or ())
     result = litho_models.close_loop(
         stores[0],
         out,
         new_prints=stores[1:],
         base=base,
+        base_settings=settings,
         folds=folds,
         nested=nested,
         inject=tuple(inject or ()),

@@ -172,6 +172,7 @@ class Effect:
         needs: facts about the print without which it cannot be tested.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
+        of_films: it moves the edges of a film seen from above; any other is of heights.
         knowledge: a cause has a name; a law only a formula; a description only a covariate.
     """
 
@@ -188,6 +189,7 @@ class Effect:
     needs: tuple[Literal["order"], ...] = ()
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
+    of_films: bool = False
     knowledge: Knowledge = "cause"
     amplitudes: tuple[str, ...] = field(init=False)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from litho_data.foundation.errors import InputError, require_known
-from litho_models.effects import exposure_spot, exposure_writing, measurement, resist
+from litho_models.effects import exposure_spot, exposure_writing, films, measurement, resist
 from litho_models.effects.effect import Effect, Parameter, of_single_scans
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.scan_terms.term import CREEP_DECAYS
@@ -102,10 +102,12 @@ _FORWARD_ORDER = (
     exposure_writing.vignetting,
     exposure_writing.laser_drift,
     exposure_spot.long_range_proximity,
+    films.electron_backscatter,
     exposure_writing.write_order_memory,
     resist.threshold_softness,
     resist.diffusion_blur,
     resist.height_saturation,
+    films.resist_diffusion,
     exposure_writing.interface_offset,
     exposure_writing.field_curvature,
     exposure_writing.hatch_ripple,
@@ -115,6 +117,7 @@ _FORWARD_ORDER = (
     resist.feature_collapse,
     resist.trench_residue,
     resist.slope_thinning,
+    films.etch_bias,
     measurement.tip_dilation,
     measurement.feedback_lag,
     measurement.piezo_nonlinearity,

@@ -16,7 +16,7 @@ FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # no scan is spent on choosing between its rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # What a fit by least squares depends on.
-LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
+LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance", "free_gain"}
 # Nothing real needs more of anything, and beyond it sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
@@ -33,6 +33,7 @@ class TrainingConfig(BaseModel):
 
     recipe: Recipe = "fast"
     variant: Variant = "default"
+    model: dict[str, Any] = Field(default_factory=dict, description="settings of the model that is trained")
     seed: int = Field(0, ge=0, lt=2**63)
     steps: int = Field(1000, ge=1, le=_MOST, description="optimiser steps")
     rounds: int = Field(

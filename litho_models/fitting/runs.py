@@ -24,6 +24,7 @@ from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
+from litho_models.models import model_class
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.background import learn_background
 from litho_models.scoring.printer_state import baseline_of
@@ -134,13 +135,19 @@ def train(
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """The settings of a recipe, checked.
+    """The settings of a recipe, checked; those that are none of a training are the model's.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.
     """
-    for name in settings:
-        require_known("training setting", name, TrainingConfig.model_fields)
+    own = {name: value for name, value in settings.items() if name not in TrainingConfig.model_fields}
+    known = [*TrainingConfig.model_fields, *model_class(model).Config.model_fields]
+    for name in own:
+        if "." not in name:
+            require_known("setting of the training or the model", name, known)
+    settings = {name: value for name, value in settings.items() if name not in own}
+    if own:
+        settings["model"] = {**settings.get("model", {}), **own}
     try:
         return TrainingConfig.of_recipe(recipe, model, **settings)
     except ValidationError as error:

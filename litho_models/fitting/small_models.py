@@ -37,8 +37,7 @@ def fit_small_model(
     Returns:
         mean absolute residual after each step, µm, the terms of the scans taken out.
     """
-    parameters = list(model.parameters())
-    if not parameters:
+    if not any(parameter.requires_grad for parameter in model.parameters()):
         return []
     terms = smooth_training_terms(policy, free_gain)
     rules = replace(RULES, pinned=len(PINNED & terms))
@@ -141,7 +140,7 @@ class _Sample:
 def _jacobian(model: Simulator, sample: _Sample) -> Array:
     """Derivatives (parameters, y, x) of the window, float64: in forward mode, all parameters in one pass."""
     prediction = _WindowPrediction(model, sample)
-    named = {f"model.{name}": parameter for name, parameter in model.named_parameters()}
+    named = {f"model.{name}": one for name, one in model.named_parameters() if one.requires_grad}
     sizes = [parameter.numel() for parameter in named.values()]
 
     def predict(vector: Tensor) -> Tensor:
@@ -153,13 +152,17 @@ def _jacobian(model: Simulator, sample: _Sample) -> Array:
     return torch.func.jacfwd(predict)(here).movedim(-1, 0).detach().double().numpy()
 
 
+def _fitted(model: Simulator) -> list[nn.Parameter]:
+    return [parameter for parameter in model.parameters() if parameter.requires_grad]
+
+
 def _vector(model: Simulator) -> Array:
-    return torch.nn.utils.parameters_to_vector(list(model.parameters())).detach().numpy().copy()
+    return torch.nn.utils.parameters_to_vector(_fitted(model)).detach().numpy().copy()
 
 
 def _load(model: Simulator, vector: Array) -> None:
     with torch.no_grad():
-        torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), model.parameters())
+        torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), _fitted(model))
 
 
 class _WindowPrediction(nn.Module):

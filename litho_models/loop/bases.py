@@ -13,6 +13,7 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.fitting import TrainingConfig, fit_in_cache
+from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.folded_base import train_folds
@@ -36,7 +37,13 @@ class Base:
 
 
 def choose_base(
-    base: str, scans: Sequence[PrintedScan], study: Study, *, steps: int | None, cache: Path
+    base: str,
+    scans: Sequence[PrintedScan],
+    study: Study,
+    *,
+    steps: int | None,
+    cache: Path,
+    fields: Mapping[str, Any] = {},
 ) -> Base:
     """The base by what was asked for; a network is trained without each fold.
 
@@ -44,17 +51,20 @@ def choose_base(
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
         study: settings: folds, seed, workers, report.
         steps: optimiser steps of a network, the recipe's if None; ``cache``: where its trainings are kept.
+        fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
-        InputError: no such base, or one of another pitch.
+        InputError: no such base, one of another pitch, or settings of one that is not a small model.
     """
+    named = _built(base, scans[0], fields) if base in MODELS else None
+    if fields and not (named and is_small(named)):
+        raise InputError(f"settings of {base}", got=", ".join(fields), wanted="a small model's name as base")
     if base == AUTO:
         return _best(scans, study)
-    if base not in MODELS:
+    if named is None:
         return _frozen(base, scans[0].pitch_um)
-    model = _built(base, scans[0])
-    if is_small(model):
-        return Base(base, model, {})
+    if is_small(named):
+        return Base(base, named, {})
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, seed=study.seed, **given)
     trainer = partial(_trained, base, recipe, cache)
@@ -73,11 +83,9 @@ def _best(scans: Sequence[PrintedScan], study: Study) -> Base:
     return Base(best, built.pop(best), built)
 
 
-def _built(name: str, scan: PrintedScan) -> Simulator:
-    fields: dict[str, Any] = {"spot": "round"} if name == "physics" else {}
-    return build_model(
-        name, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um, levels=scan.levels, **fields
-    )
+def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simulator:
+    usual: dict[str, Any] = {"spot": "round"} if name == "physics" else {}
+    return build_model(name, **common_geometry([scan]), **{**usual, **fields})
 
 
 def _trained(base: str, settings: TrainingConfig, cache: Path, scans: Sequence[PrintedScan]) -> nn.Module:

@@ -115,7 +115,11 @@ def close(
         return Learner(at_work, held_out_maps(start.per_fold, at_work, at_work.scans))
 
     excluded = untestable(at_work)
-    causes = [one for one in screened_effects(at_work.tip_radius_um) if one.name not in excluded]
+    causes = [
+        one
+        for one in screened_effects(at_work.tip_radius_um)
+        if one.name not in excluded and one.of_films == at_work.of_films
+    ]
     chosen = _chosen(start, at_work, causes, learner)
     # By the model, so that a stage that changes nothing counts with the one before it.
     stages: dict[State, str] = {start: "base"}
@@ -145,7 +149,8 @@ def _chosen(
     """
     named = search(start, study, candidates)
     failed: list[Checked] = []
-    laws, tables = list(LAWS.values()), list(TABLES.values())
+    # Laws and tables are of heights.
+    laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")

@@ -22,6 +22,7 @@ from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.records import Prediction
+from litho_models.scoring.shapes import edges_of_scan
 from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
@@ -35,14 +36,15 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy.
+    """Errors of maps (y, x) µm under each reported policy; films have no zero of their own to be freed of.
 
     Args:
         numbers: fitted numbers of printer and measurement; ``terms``: model, measurement and held_out of
             ``ErrorRow``.
     """
     rows = []
-    for policy in REPORTED:
+    films = scans[0].seen_by == "sem"
+    for policy in ("none",) if films else REPORTED:
         fits = [
             cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
             for scan, own in zip(scans, maps_um, strict=True)
@@ -60,6 +62,11 @@ def error_rows(
                 mae_ci95_nm=interval(mae),
                 rmse_nm=float(np.sqrt(np.mean(mse))),
                 by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
+                edge_by_scan_nm={
+                    scan.id: edges_of_scan(scan, own, fit.residual_um).mean_nm or 0.0
+                    for scan, own, fit in zip(scans, maps_um, fits, strict=True)
+                    if films
+                },
             )
         )
     return rows
@@ -95,8 +102,9 @@ class HeldOut:
         numbers = len(plain.twin.vector)
         maps = held_out_maps(plain.per_fold, self.study, self.closed.original)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
-        # A smooth background has five numbers.
-        rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
+        if not self.closed.study.of_films:
+            # A smooth background has five numbers.
+            rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
         for name, state in self.stages.items():
             self.study.report("scoring the base" if name == "base" else f"scoring {name}")
             rows += self._rows(*self._by_fold(state), name)
@@ -126,15 +134,15 @@ class HeldOut:
         The printer is left as it stands, the measurement learned again beside it.
         """
 
-        def mae_nm(state: State) -> float:
+        def error_nm(state: State) -> float:
             rows = self._rows(*self._by_fold(state, refit=False), "all")
-            return next(row.mae_nm for row in rows if row.is_headline)
+            return next(row.leading_nm for row in rows if row.is_headline)
 
         model, found = self.closed.final, {}
-        whole_nm = mae_nm(model) if model.twin.names else 0.0
+        whole_nm = error_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
-            found[name] = mae_nm(model.without(name, self.study)) - whole_nm
+            found[name] = error_nm(model.without(name, self.study)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:

@@ -74,6 +74,11 @@ class Study:
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
+    @property
+    def of_films(self) -> bool:
+        """Whether the scans are micrographs of a film: what counts are its edges, and no height drifts."""
+        return self.scans[0].stored.seen_by == "sem"
+
     @cached_property
     def groups(self) -> dict[str, Labels]:
         """The groups that the scans fall into."""

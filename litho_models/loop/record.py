@@ -12,7 +12,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE
 from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
-from litho_models.scan_terms.policies import Policy
+from litho_models.scan_terms.policies import Policy, usual_policy
 from litho_models.scoring.statistics import OverUnits
 from litho_models.splits.folds import Split
 
@@ -44,6 +44,7 @@ class ErrorRow(Record):
         held_out: folds of scans, or whole prints; nested where everything was chosen anew without them.
         printer_numbers: fitted numbers of the model; ``measurement_numbers``: of the measurement, the largest
             of any fold.
+        edge_by_scan_nm: mean distance of the edges, of films.
     """
 
     model: Stage
@@ -57,11 +58,23 @@ class ErrorRow(Record):
     mae_ci95_nm: tuple[float, float] | None
     rmse_nm: float
     by_scan_nm: dict[str, float]
+    edge_by_scan_nm: dict[str, float] = Field(default_factory=dict)
+
+    @property
+    def leading_by_scan_nm(self) -> dict[str, float]:
+        """The error that counts: of the edges of films, of all heights otherwise."""
+        return self.edge_by_scan_nm or self.by_scan_nm
+
+    @property
+    def leading_nm(self) -> float:
+        """Its mean over the scans."""
+        return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
 
     @property
     def is_headline(self) -> bool:
-        """Whether it is the one that is quoted: k = 1, the shared measurement, folds of scans."""
-        return (self.policy, self.measurement, self.held_out) == ("offset", "shared", "scans")
+        """Whether it is the one that is quoted: k = 1 (films 0), the shared measurement, folds of scans."""
+        usual = usual_policy(bool(self.edge_by_scan_nm))
+        return (self.policy, self.measurement, self.held_out) == (usual, "shared", "scans")
 
 
 class Strength(Record):
@@ -236,11 +249,12 @@ class CloseLoop(Result):
     def error(
         self,
         model: Stage,
-        policy: Policy = "offset",
+        policy: Policy | None = None,
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """One row of the errors; None if it was not measured."""
+        """One row of the errors, with the usual terms unless stated; None if it was not measured."""
+        policy = policy or usual_policy(bool(self.errors[0].edge_by_scan_nm))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)
         return next(rows, None)

@@ -28,8 +28,8 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         result.error("base", measurement="published"),
         *(row for row in result.errors if row.is_headline),
     ]
-    page.tiles([(f"{row.mae_nm:.2f} nm", said("stage", row)) for row in shown if row])
-    page.paragraph("Mean absolute error on held-out scans; the zero of each scan is free.")
+    page.tiles([(f"{row.leading_nm:.2f} nm", said("stage", row)) for row in shown if row])
+    page.paragraph("Mean error on held-out scans.")
     if result.effects:
         page.heading("What was found")
         page.points([said("effect", one) for one in result.effects])

@@ -52,7 +52,8 @@ def record(
     effects = [_found(closed, one, left_out_nm, survives_on) for one in closed.found]
     by_stage = {row.model: row for row in errors if row.is_headline}
     before, after = by_stage["base"], by_stage["all"]
-    gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
+    was_nm, is_nm = before.leading_by_scan_nm, after.leading_by_scan_nm
+    gains = [was_nm[scan.id] - is_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
         **given,
@@ -205,8 +206,10 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
     """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
     sets = {other: one.name for one in added for other in one.confusable_with}
-    untestable = {**UNTESTABLE, **closed.untestable}
-    names = dict.fromkeys([*untestable, *(one.name for one in CATALOGUE.values() if not one.per_scan)])
+    films = closed.study.of_films
+    untestable = {} if films else {**UNTESTABLE, **closed.untestable}
+    tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
+    names = dict.fromkeys([*untestable, *tried])
     found = []
     for name in names:
         if name not in seen and all(one.name != name for one in added):

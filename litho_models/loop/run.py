@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from torch import nn
@@ -24,7 +24,7 @@ from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
 from litho_models.loop.model import is_refitted
 from litho_models.loop.planting import parse_planted, plant
-from litho_models.loop.record import CloseLoop, ErrorRow
+from litho_models.loop.record import CloseLoop, ErrorRow, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
@@ -42,6 +42,7 @@ def close_loop(
     out: str | Path,
     *,
     base: str = AUTO,
+    base_settings: Mapping[str, Any] = {},
     folds: int = GROUPED_FOLDS,
     nested: Nested | None = None,
     inject: Sequence[str] = (),
@@ -60,6 +61,7 @@ def close_loop(
     Args:
         store: made by ``litho-data build``.
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
+        base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
         folds: of scans; each scan is predicted by fits that have not seen its fold.
         nested: also choose everything anew without each fold, or each print, and judge it there.
         inject: ``NAME=AMOUNT`` each, planted in copies of the scans: is it found?
@@ -79,7 +81,8 @@ def close_loop(
     opened = open_store(store)
     development, locked, dropped = _usable_scans(opened)
     settings = {
-        "base": base, "folds": folds, "nested": nested, "inject": list(inject), "steps": steps,
+        "base": base, "base_settings": dict(base_settings), "folds": folds, "nested": nested,
+        "inject": list(inject), "steps": steps,
         "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
@@ -89,7 +92,9 @@ def close_loop(
         kept_open(Workers(workers, dask)) as places,
     ):
         study = Study((), dealt(development, folds, seed), seed, places, report)
-        chosen = choose_base(base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"))
+        chosen = choose_base(
+            base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"), fields=base_settings
+        )
         if nested and not is_refitted(chosen.model):
             raise InputError(
                 f"--nested with {base}", got="a model that is not fitted here", wanted="a small model's name"
@@ -106,14 +111,17 @@ def close_loop(
         if open_lock_box and locked:
             errors += errors_of_others([(held_out, locked)], locked, "locked", seed)
 
-        report("looking at what single scans add")
-        maps, residuals = held_out.maps_um(closed.final), held_out.residuals()
-        terms = SingleScans(study, closed.original, maps).findings()
-        seen = marks(closed.original, maps, _rounding_um(opened, development))
+        alone: list[ScanFinding] = []
+        residuals = held_out.residuals()
+        if not closed.study.of_films:
+            report("looking at what single scans add")
+            maps = held_out.maps_um(closed.final)
+            terms = SingleScans(study, closed.original, maps).findings()
+            alone = with_marks(terms, marks(closed.original, maps, _rounding_um(opened, development)))
         result = record(
             closed,
             errors,
-            single_scans=with_marks(terms, seen),
+            single_scans=alone,
             left_out_nm=left_out_nm,
             survives_on=survives_on,
             run=run_info([seed], len(development), dropped),

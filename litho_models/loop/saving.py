@@ -65,6 +65,6 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
         training_step_share=step_share([scan.stored for scan in closed.original]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
-            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": "offset"},
+            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},
         ],
     )

@@ -3,22 +3,34 @@
 from collections.abc import Sequence
 from typing import Any
 
+from pydantic import ValidationError
+
+from litho_data.commands.settings import refused
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
-from litho_models.models.electron_beam import ElectronBeam
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
+from litho_models.models.parts import register_part
 from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
+from litho_models.models.printers import DmdGrayscale, ElectronBeam, LaserWriter, Printer, Projection
 from litho_models.simulator import Simulator, Variant
 
-__all__ = ["MODELS", "build_model", "model_class", "register_simulator", "require_models"]
+__all__ = [
+    "MODELS",
+    "build_model",
+    "fixed_numbers",
+    "model_class",
+    "register_part",
+    "register_simulator",
+    "require_models",
+]
 
 MODELS: dict[str, type[Simulator]] = {
     model.name: model
     for model in (
         *(Identity, Affine, AffineMtf, BlurTable, Linear),
-        *(Features, RandomFeatures, Physics, ElectronBeam, Pbl, Fno),
+        *(Features, RandomFeatures, Physics, ElectronBeam, Projection, LaserWriter, DmdGrayscale, Pbl, Fno),
     )
 }
 
@@ -26,7 +38,7 @@ MODELS: dict[str, type[Simulator]] = {
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
     """Take a model by its name from now on, in every function and command of this process.
 
-    To work in several processes, call this in a module that every process imports.
+    In a plug-in, of every process of a command.
 
     Raises:
         InputError: no name of its own, or one that is taken.
@@ -64,7 +76,34 @@ def require_models(names: Sequence[str]) -> None:
         )
 
 
+def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
+    """The numbers of a model that no fit changes: the usual ones, some more, and some less.
+
+    Raises:
+        InputError: an unknown model, or a number to free that is not fixed.
+    """
+    usual = model_class(name).Config.model_fields["fixed"].default
+    for one in free:
+        require_known(f"fixed number of {name}", one, usual)
+    return [*dict.fromkeys(one for one in (*usual, *fix) if one not in free)]
+
+
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
-    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters)."""
-    model = model_class(name)
-    return model(model.Config.of_variant(variant, **fields))
+    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters).
+
+    Raises:
+        InputError: an unknown model or field, or a value that the field does not take.
+    """
+    kind = model_class(name)
+    for field in fields:
+        if "." not in field or not issubclass(kind, Printer):
+            require_known(f"setting of {name}", field, kind.Config.model_fields)
+    try:
+        model = kind(kind.Config.of_variant(variant, **fields))
+    except ValidationError as error:
+        raise refused(error) from None
+    numbers = {key: key for key, _ in model.named_parameters()}
+    numbers |= {key: own.name for key, own in model.ranges.items()}
+    for fixed in model.config.fixed:
+        require_known(f"number of {name} to fix", fixed, [*numbers.values()])
+    return model

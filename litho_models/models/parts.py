@@ -1,18 +1,72 @@
-"""The parts of a printer: pure functions from one field to the next, each with its physics.
+"""The parts of a printer: each a function from one field to the next, with its numbers and its source.
 
-Fields are (batch, 1, y, x), relative to a full dose or height; values are tensors, which can be fitted.
+Fields are (batch, 1, y, x), relative to a full dose or height. A part may cut them by its reach.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from litho_data.foundation.errors import InputError, require_known
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.ranges import Range
+from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
 from litho_models.simulator import crop_border
 
 # Change of the resist from pixel to pixel below which there is no edge.
-_FLATTEST = 5e-3
+FLATTEST = 5e-3
+# Where a length starts, times this, ends its range.
+_WIDEST = 5.0
+_BIAS_PX = 5.0
+_CORNERS = 20.0
+# Tensors; those that are not fitted are plain numbers.
+Values = Mapping[str, Any]
+Apply = Callable[[Tensor, Values, float], Tensor]
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a part.
+
+    Attributes:
+        start: where a fit begins; ``unit``: ``1`` for none.
+        lower, upper: its range; by default a length ends at five times its start.
+        fitted: or else it is what one says.
+    """
+
+    start: float
+    unit: str = "1"
+    lower: float = 0.0
+    upper: float | None = None
+    fitted: bool = True
+
+    def range_at(self, name: str, start: float) -> Range:
+        """The range of a fit that begins there."""
+        upper = self.upper if self.upper is not None else _WIDEST * start if self.unit == "µm" else math.inf
+        return Range(name, self.lower, upper)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stage of a printer.
+
+    Attributes:
+        name, stage: what it is called, and where it acts.
+        numbers: by name, see ``Number``; ``source``: where the formula comes from.
+        apply: field, values, pitch (µm) to the next field, cut by ``reach_px`` of values and pitch.
+    """
+
+    name: str
+    stage: Literal["illumination", "resist", "diffusion", "transfer"]
+    numbers: Mapping[str, Number]
+    apply: Apply
+    source: str
+    reach_px: Callable[[Values, float], int] = field(default=lambda values, pitch_um: 0)
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
@@ -56,6 +110,12 @@ def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
     return turned / (turned + threshold**contrast)
 
 
+def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
+    """Resist: share of the depth developed, 1 + γ log₁₀(E / E₀) between 0 and 1, its corners rounded."""
+    depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
+    return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
+
+
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
     """Transfer: coverage of a film etched where resist stands above the threshold; cut by one pixel.
 
@@ -64,5 +124,140 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
-    slope = torch.sqrt(slope_y**2 + slope_x**2 + _FLATTEST**2)
+    slope = torch.sqrt(slope_y**2 + slope_x**2 + FLATTEST**2)
     return torch.sigmoid(4 * ((crop_border(resist, 1) - threshold) / slope + bias_um / pitch_um))
+
+
+def _spots(values: Values) -> list[tuple[Tensor | float, Tensor]]:
+    """Share and width of each Gaussian of a spot of one to three."""
+    back, between = values.get("back_share", 0.0), values.get("between_share", 0.0)
+    shares = {"sigma_um": (1 - back) * (1 - between), "back_um": back, "between_um": (1 - back) * between}
+    return [(share, values[name]) for name, share in shares.items() if name in values]
+
+
+def _spot_reach_px(values: Values, pitch_um: float) -> int:
+    return max(spot_radius_px(sigma_um, pitch_um) for _, sigma_um in _spots(values))
+
+
+def _by_spots(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
+    return illuminate(pattern, _spots(values), pitch_um, _spot_reach_px(values, pitch_um))
+
+
+def _diffuse(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
+    sigma_um = values["sigma_um"]
+    return blur_interior(resist, sigma_um / pitch_um, spot_radius_px(sigma_um, pitch_um))
+
+
+def _optics(values: Values) -> Optics:
+    return Optics(**{**values, "kernels": int(values["kernels"])})
+
+
+_SIGMA = {"sigma_um": Number(0.2, "µm")}
+_BACK = {"back_um": Number(0.6, "µm"), "back_share": Number(0.2, upper=0.9)}
+_BETWEEN = {"between_um": Number(0.4, "µm"), "between_share": Number(0.1, upper=0.9)}
+_THRESHOLD = {"threshold": Number(0.5, upper=1.0)}
+_CONTRAST = {"contrast": Number(4.0), **_THRESHOLD}
+_STATED = {
+    "wavelength_um": Number(0.365, "µm", fitted=False),
+    "na": Number(0.5, upper=1.0, fitted=False),
+    "outer": Number(0.6, upper=3.0, fitted=False),
+    "inner": Number(0.0, upper=3.0, fitted=False),
+    "defocus_um": Number(0.0, "µm", -100.0, 100.0, fitted=False),
+    "kernels": Number(12, upper=400, fitted=False),
+}
+_CHANG = "sum of Gaussians: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)"
+
+
+def _illumination(name: str, numbers: Mapping[str, Number]) -> Part:
+    return Part(name, "illumination", numbers, _by_spots, _CHANG, _spot_reach_px)
+
+
+PARTS = {
+    part.name: part
+    for part in (
+        _illumination("spot", _SIGMA),
+        _illumination("two-spots", {**_SIGMA, **_BACK}),
+        _illumination("three-spots", {**_SIGMA, **_BACK, **_BETWEEN}),
+        Part(
+            "lens",
+            "illumination",
+            _STATED,
+            lambda pattern, values, pitch: intensity(pattern, _optics(values), pitch),
+            "partially coherent imaging: Hopkins, Proc. R. Soc. A 217, 408 (1953)",
+            lambda values, pitch: kernel_reach_px(_optics(values), pitch),
+        ),
+        Part(
+            "tanh",
+            "resist",
+            _CONTRAST,
+            lambda dose, values, pitch: project(dose, values["contrast"], values["threshold"]),
+            "projection of Wang et al. 2011, doi:10.1007/s00158-010-0602-y",
+        ),
+        Part(
+            "hill",
+            "resist",
+            _CONTRAST,
+            lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
+            "share that a dose turns, with a half at the threshold",
+        ),
+        Part(
+            "contrast-curve",
+            "resist",
+            {"contrast": Number(1.5), "clearing": Number(0.9, upper=3.0)},
+            lambda dose, values, pitch: contrast_curve(dose, values["contrast"], values["clearing"]),
+            "depth by the logarithm of the dose: Mack, Fundamental Principles of Optical Lithography, 2007",
+        ),
+        Part(
+            "inverted",
+            "resist",
+            {},
+            lambda resist, values, pitch: 1 - resist,
+            "a positive resist stands where a negative one does not, an imprint where its master does not",
+        ),
+        Part(
+            "diffusion",
+            "diffusion",
+            {"sigma_um": Number(0.1, "µm")},
+            _diffuse,
+            "Gaussian spread of what the dose made",
+            lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
+        ),
+        Part(
+            "etch",
+            "transfer",
+            {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
+            lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
+            "a film that stays where resist stands, its edge moved by a bias",
+            lambda values, pitch: 1,
+        ),
+        Part(
+            "transfer",
+            "transfer",
+            {"selectivity": Number(1.0)},
+            lambda resist, values, pitch: values["selectivity"] * resist,
+            "directional etching: a relief in proportion to that of the resist",
+        ),
+    )
+}
+
+
+def register_part(part: Part) -> Part:
+    """Take a part by its name from now on, in ``parts`` of the printers of this process.
+
+    Raises:
+        InputError: a name that is taken.
+    """
+    if part.name in PARTS:
+        raise InputError("part to register", got=part.name, wanted="a name that is not taken")
+    PARTS[part.name] = part
+    return part
+
+
+def part_of(name: str) -> Part:
+    """The part of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    require_known("part of a printer", name, PARTS)
+    return PARTS[name]

@@ -64,10 +64,12 @@ def learn_measurement(
 
     Parts are added one at a time as long as they lower the error on scans that they were not fitted to, dealt
     into folds among these scans, and only if they do so beyond the scatter over scans. Where fields differ in
-    size, those of the most frequent one are learned from.
+    size, those of the most frequent one are learned from. Micrographs of films share nothing of the kind.
     """
     usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
     model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
+    if scans[0].seen_by == "sem":
+        return model
     pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
     model = model.model_copy(update={"levelling": _best_levelling(pairs, model), "scans": len(pairs)})
     chosen: list[_Offer] = []

@@ -19,7 +19,6 @@ from litho_design.optics import Optics, RSPropagator, centred_grid
 from litho_design.printers.printer import Printer
 from litho_design.tasks import task as task_module
 from litho_design.tasks.bench import ElementBench
-from litho_design.tasks.task import register_tasks_of
 
 ROOT = Path(__file__).parents[2]
 TINY = {
@@ -77,7 +76,7 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
 
 
 def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsys, refused):
-    """``--task-file`` runs the file with its task; without it, and with another file, the command says so."""
+    """``--plugin`` runs the file with its task; without it, or if the file fails, the command says so."""
     file, out = tmp_path / "far_corner.py", tmp_path / "design"
     file.write_text(
         "import litho_design\n@litho_design.register_task\nclass FarCorner(litho_design.Task):\n"
@@ -87,7 +86,7 @@ def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsy
     )
     known = dict(task_module._TASKS)
     monkeypatch.setattr(task_module, "_TASKS", known)
-    register_tasks_of(file)
+    exec(compile(file.read_text(), str(file), "exec"), {"__name__": "far_corner"})
     settings = design_settings(
         TINY
         | {"layout.size_px": 32, "search.iterations": 1, "search.polish_rounds": 0, "window.yield_draws": 2}
@@ -95,13 +94,11 @@ def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsy
     made = design(known["far-corner"], "none", out, settings=settings, announce=False)
     del known["far-corner"]
     words = ["score", out, "--judge", "none", "--out", tmp_path / "score"]
-    assert "--task-file" in refused(*words)
-    empty = tmp_path / "empty.py"
-    empty.write_text("")
-    assert "no task" in refused(*words, "--task-file", empty)
-    empty.write_text("1 / 0")
-    assert "ZeroDivisionError" in refused(*words, "--task-file", empty)
-    monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, words), "--task-file", str(file)])
+    assert "--plugin" in refused(*words)
+    failing = tmp_path / "failing.py"
+    failing.write_text("1 / 0")
+    assert "ZeroDivisionError" in refused(*words, "--plugin", failing)
+    monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, words), "--plugin", str(file)])
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 0

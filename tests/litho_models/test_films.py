@@ -23,6 +23,7 @@ from tests.litho_models.prints import make_scans, write_store
 
 FILM_UM, PITCH_UM = 0.22, 0.004
 GEOMETRY = {"pitch_um": PITCH_UM, "levels": 17, "level_height_um": FILM_UM / 16}
+BARE = {"parts": ("spot", "etch"), "spot.sigma_um": 0.02}
 
 
 def _disc(radius_px: float, size_px: int = 96) -> np.ndarray:
@@ -101,7 +102,7 @@ def test_etching_moves_an_edge_by_its_bias_whatever_the_slope_of_the_resist(bias
 
 
 def test_the_spot_of_a_printer_rounds_corners_and_a_blurred_edge_stays_where_it_is() -> None:
-    model = build_model("e-beam", spots=1, resist="threshold", diffusion=False, etch_bias=False, **GEOMETRY)
+    model = build_model("e-beam", **BARE, fixed=("etch.bias_px",), **GEOMETRY)
     layout = torch.zeros(1, 1, 120, 120)
     layout[..., 40:80, 40:80] = FILM_UM
     with torch.no_grad():
@@ -111,10 +112,8 @@ def test_the_spot_of_a_printer_rounds_corners_and_a_blurred_edge_stays_where_it_
 
 
 def test_a_fit_finds_the_spot_the_threshold_and_the_bias_of_a_film() -> None:
-    parts = {"spots": 1, "resist": "threshold", "diffusion": False}
-    true = build_model("e-beam", forward_um=0.016, threshold=0.45, **parts, **GEOMETRY)
-    with torch.no_grad():
-        true.raw_bias_um.copy_(true.ranges["raw_bias_um"].raw(0.002))
+    numbers = {"spot.sigma_um": 0.016, "etch.threshold": 0.45, "etch.bias_px": 0.5}
+    true = build_model("e-beam", **(BARE | numbers), fixed=(), **GEOMETRY)
     level = 16 * (gaussian_filter(np.random.default_rng(0).normal(size=(2, 128, 128)), (0, 5, 5)) > 0)
     scans = []
     for number, one in enumerate(level.astype(np.uint8)):
@@ -122,11 +121,11 @@ def test_a_fit_finds_the_spot_the_threshold_and_the_bias_of_a_film() -> None:
         with torch.no_grad():
             height = true(torch.from_numpy(scan.layout_um)[None, None])[0, 0].numpy()
         scans.append(replace(scan, height_um=height))
-    found = build_model("e-beam", forward_um=0.02, **parts, **GEOMETRY)
+    found = build_model("e-beam", **BARE, fixed=(), **GEOMETRY)
     fit_small_model(found, scans, "none")
     # Without noise the fit ends where a step gains less than 1e-4 of the error, which is next to nothing.
     for name, value in true.values.items():
-        assert float(found.values[name]) == pytest.approx(float(value), rel=0.03, abs=2e-4), name
+        assert float(found.values[name]) == pytest.approx(float(value), rel=0.03, abs=0.05), name
 
 
 def test_defaults_of_models_follow_the_pitch_of_another_printer() -> None:

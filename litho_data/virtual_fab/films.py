@@ -1,0 +1,218 @@
+"""A fab for films: written by an electron beam or through a lens, etched, seen in an electron microscope.
+
+It shares no code with the models: scattering is a product of spectra, a lens sums the images by the points of
+its source, and an edge is a distance that etching moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, zoom
+
+from litho_data.commands.progress import progress
+from litho_data.foundation.begun import whole_folder
+from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation.results import Result
+from litho_data.layouts.card_text import CARD_NAME, write_layout
+from litho_data.layouts.random_layout import random_layout
+from litho_data.virtual_fab.canvas import blur
+
+# Pixels of the image to one of the layout, where an edge is sought, and of the micrograph.
+_FINER, _AROUND = 4, 64
+_RESIST = 30.0
+_SOURCE_POINTS = 9
+_CARD = """name = "virtual-{process}"
+title = "Simulated films of the process {process}, with simulated micrographs"
+
+[layout]
+files = "layouts/{{id}}.tif"
+pitch_um = {pitch_um}
+levels = 2
+level_height_um = {film_um}
+
+[scan]
+files = "scans/{{id}}.png"
+instrument = "sem"
+size_um = [{side_um}, {side_um}]
+
+[write]
+surround = "unknown"
+"""
+
+
+@dataclass(frozen=True)
+class FilmKnobs:
+    """What a process may have beyond plain printing; lengths in µm.
+
+    Attributes:
+        backscatter: electrons (or stray light) that come back, relative to the dose; ``backscatter_um``: over
+            which length.
+        diffusion_um: sd by which what the dose made spreads.
+        etch_bias_um: shift of every edge, outward.
+        defocus_um: of the lens; ``dose_error``: relative.
+        charging: relative change of brightness across a micrograph.
+    """
+
+    backscatter: float = 0.0
+    backscatter_um: float = 0.1
+    diffusion_um: float = 0.0
+    etch_bias_um: float = 0.0
+    defocus_um: float = 0.0
+    dose_error: float = 0.0
+    charging: float = 0.0
+
+
+@dataclass(frozen=True)
+class FilmPrinter:
+    """A machine: process, sampling, film, beam (sd) or lens; threshold of the resist, of a full dose."""
+
+    process: Literal["e-beam", "projection"]
+    pitch_um: float
+    spot_um: float = 0.02
+    film_um: float = 0.22
+    threshold: float = 0.5
+    wavelength_um: float = 0.365
+    na: float = 0.5
+    source: float = 0.6
+
+
+FILM_PRINTERS = {
+    "e-beam": FilmPrinter("e-beam", pitch_um=0.004),
+    "projection": FilmPrinter("projection", pitch_um=0.06, threshold=0.3),
+}
+
+
+class FilmTruth(Result):
+    """``films.json``; the distances of the edges of each film lie beside it, ``<id>.npy``, layout pixels."""
+
+    SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
+    FILE_NAME: ClassVar[str] = "films.json"
+
+    process: str
+    knobs: FilmKnobs
+    seed: int
+    count: int
+    size_px: int
+
+
+def film_knobs(words: Iterable[str]) -> FilmKnobs:
+    """Knobs of words ``name=value``.
+
+    Raises:
+        InputError: a name that is none, or a value that is no number.
+    """
+    values = {}
+    for name, value in (word.split("=", 1) if "=" in word else (word, "") for word in words):
+        require_known("knob of a film", name, [one.name for one in fields(FilmKnobs)])
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise InputError(f"knob {name}", got=repr(value), wanted="a number") from None
+    return FilmKnobs(**values)
+
+
+def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
+    """Distance of the film's edge, positive on the film: of 4 × 4 places in each pixel of a layout, 0 or 1.
+
+    The layout is periodic; distances are in pixels of the layout.
+    """
+    pitch = printer.pitch_um
+    written = np.asarray(level, float)
+    if knobs.backscatter:
+        back = blur(written, pitch, knobs.backscatter_um)
+        written = (written + knobs.backscatter * back) / (1 + knobs.backscatter)
+    if printer.process == "e-beam":
+        dose = blur(written, pitch, printer.spot_um)
+    else:
+        dose = _imaged(written, printer, knobs.defocus_um)
+    field, threshold = (1 + knobs.dose_error) * dose, printer.threshold
+    if knobs.diffusion_um:
+        turned = 1 / (1 + np.exp(-_RESIST * (field - threshold)))
+        field, threshold = blur(turned, pitch, knobs.diffusion_um), 0.5
+    fine = zoom(field, _FINER, order=3, mode="grid-wrap", grid_mode=True) > threshold
+    # Edges beyond the border count too: the layout goes on there.
+    fine = np.pad(fine, _AROUND, mode="wrap")
+    inside, outside = distance_transform_edt(fine), distance_transform_edt(~fine)
+    distance = np.where(fine, inside - 0.5, 0.5 - outside)[_AROUND:-_AROUND, _AROUND:-_AROUND]
+    return distance / _FINER + knobs.etch_bias_um / pitch
+
+
+def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
+    """What an electron microscope shows of an edge, uint8: bright rims, charging along x, noise."""
+    film = 1 / (1 + np.exp(-_FINER * distance_px / 0.5))
+    grey = 70 + film * (70 + 60 * np.exp(-np.maximum(_FINER * distance_px, 0) / 12))
+    grey = grey * (1 + knobs.charging * np.linspace(-1, 1, distance_px.shape[1]))
+    return np.clip(grey + rng.normal(0, 3, grey.shape), 0, 255).astype(np.uint8)
+
+
+def simulate_films(
+    out: str | Path,
+    process: str,
+    *,
+    count: int = 12,
+    size_px: int = 256,
+    seed: int = 0,
+    knobs: FilmKnobs = FilmKnobs(),
+) -> Path:
+    """Print films of random layouts and take their micrographs; returns the path of the card.
+
+    ``out/raw`` is what a laboratory would deliver; ``out/truth`` has knobs and distances of the edges.
+
+    Raises:
+        InputError: no such process, or a folder with something else in it.
+    """
+    import cv2
+
+    require_known("process of a film", process, FILM_PRINTERS)
+    printer = FILM_PRINTERS[process]
+    truth = FilmTruth(process=process, knobs=knobs, seed=seed, count=count, size_px=size_px)
+    facts = truth.model_dump(mode="json", exclude={"schema_"})
+    with whole_folder(out, "raw", "truth", record=f"truth/{truth.FILE_NAME}", facts=facts) as folder:
+        raw, hidden = folder / "raw", folder / "truth"
+        for part in (raw / "scans", hidden):
+            part.mkdir(parents=True)
+        for number in progress(range(count), "printing films"):
+            rng, name = np.random.default_rng([seed, number]), f"F{number:02}"
+            level = random_film((size_px, size_px), printer, rng, finer=number % 3)
+            distance = edge_distance_px(level, printer, knobs)
+            write_layout(raw, name, level)
+            np.save(hidden / f"{name}.npy", distance.astype(np.float32))
+            cv2.imwrite(str(raw / "scans" / f"{name}.png"), micrograph(distance, knobs, rng))
+        side_um = round(size_px * printer.pitch_um, 9)
+        text = _CARD.format(
+            process=process, pitch_um=printer.pitch_um, film_um=printer.film_um, side_um=side_um
+        )
+        (raw / CARD_NAME).write_text(text, encoding="utf-8")
+        truth.write(hidden)
+    return Path(out) / "raw" / CARD_NAME
+
+
+def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
+    """A random layout, uint8 (ny, nx) of 0 and 1, of features that the process resolves; a third are fine."""
+    lens_um = 0.25 * printer.wavelength_um / printer.na
+    smallest_um = printer.spot_um if printer.process == "e-beam" else lens_um
+    cutoff_per_um = 1 / (smallest_um * (7 - finer))
+    return random_layout(
+        shape, levels=2, cutoff_per_um=cutoff_per_um, pitch_um=printer.pitch_um, seed=rng, passband="round"
+    )
+
+
+def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
+    """Intensity of a mask, 1 where all is open: the mean of its images by the points of a round source."""
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
+    spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)
+    sides = np.linspace(-1, 1, _SOURCE_POINTS)
+    points = [(y, x) for y in sides for x in sides if y * y + x * x <= 1]
+    for y, x in printer.source * printer.na / printer.wavelength_um * np.array(points):
+        sine2 = printer.wavelength_um**2 * ((fy + y) ** 2 + (fx + x) ** 2)
+        through = sine2 <= printer.na**2
+        path_um = defocus_um * (np.sqrt(np.where(through, 1 - sine2, 1.0)) - 1)
+        waves = through * np.exp(2j * np.pi * path_um / printer.wavelength_um)
+        total += np.abs(np.fft.ifft2(spectrum * waves)) ** 2
+    return total / len(points)

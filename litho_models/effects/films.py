@@ -1,0 +1,77 @@
+"""Films: what moves the edges of a film that is written, developed or etched, and seen from above.
+
+Lengths are in pixels of the layout, which resolve the machine that writes, be it a beam or a lens.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_models.effects.effect import FieldContext, Parameter, Values, entry
+from litho_models.effects.filters import add_blur, add_warp, gradient
+from litho_models.models.parts import FLATTEST, etch
+
+# Blurs of a film that give its edges a normal, and a sharp rim a place; reach of a diffusion.
+_NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
+
+_of_films = partial(entry, role="process", of_films=True)
+
+
+@_of_films(
+    "electrons that come back from the substrate",
+    {
+        "weight": Parameter("1", 0.0, 1.5, 0.1),
+        "length_px": Parameter("px", 8.0, 280.0, 25.0, "shape", tried=(14.0, 28.0, 56.0, 112.0)),
+    },
+    stage="exposure",
+    acts_on="layout",
+    source="second Gaussian of the proximity function: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)",
+    separating="write one feature alone and inside dense surroundings of three sizes",
+)
+def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = (M + η G_b * M) / (1 + η): the dose of what is written within b comes back."""
+    weight, length = values["weight"], values["length_px"]
+    blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
+    return layout + weight / (1 + weight) * (blurred - layout)
+
+
+@_of_films(
+    "what the dose made spreading before there is an edge",
+    {"variance_px2": Parameter("px²", 0.0, 150.0, 8.0, tried=(8.0, 45.0))},
+    stage="resist",
+    acts_on="height",
+    source="acid or reactants that diffuse in a resist of high contrast, then a threshold at one half",
+    separating="write necks and islands of five widths, bake for two times",
+)
+def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The film blurred by a Gaussian of variance s², and its edge put where the blurred film is one half."""
+    full = context.full_height_um
+
+    def edged(variance_px2: Tensor) -> Tensor:
+        # A sharp rim says too little of where within a pixel its edge is: both are blurred by some.
+        blurred = add_blur(height / full, variance_px2 + _RIM_PX**2, 1.0, _DIFFUSION_REACH_PX)
+        return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, 1.0)
+
+    variance = values["variance_px2"]
+    return height + edged(variance) - edged(0 * variance)
+
+
+@_of_films(
+    "edges shifted in etching or development",
+    {"bias_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))},
+    stage="development",
+    acts_on="height",
+    source="lateral etching at a rate of its own, the same at every dose and in every surrounding",
+    separating="write one layout at five doses: a bias is the same at each",
+)
+def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H looked up at a distance of the bias inward: along the normal, edges move outward by it."""
+    normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
+    along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
+    steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)
+    share = values["bias_px"] / steepness
+    return add_warp(height, share * along_y, share * along_x, 1.0)

@@ -1,0 +1,115 @@
+"""Partially coherent imaging by a sum of coherent systems (SOCS).
+
+Hopkins: I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross coefficients
+C(f₁, f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408 (1953)). C is
+A⁺A with A(s, f) = P(s + f), so that the singular vectors of A are its kernels: I = Σ_k |h_k * t|² (Cobb, PhD
+thesis, Berkeley 1998).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+
+# Of λ / NA: beyond it a kernel is cut off.
+_REACH = 4.0
+
+
+class Optics(NamedTuple):
+    """A projection lens and its light.
+
+    Attributes:
+        wavelength_um, na: of the light, and on the side of the image.
+        outer, inner: radii of a round or ring-shaped source, relative to the pupil; 0: a point.
+        defocus_um: distance of the resist from the focus.
+        kernels: how many there are, the strongest first.
+    """
+
+    wavelength_um: float
+    na: float
+    outer: float
+    inner: float
+    defocus_um: float
+    kernels: int
+
+
+def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
+    """Pixels to each side that a kernel holds."""
+    return max(1, math.ceil(_REACH * optics.wavelength_um / optics.na / pitch_um))
+
+
+def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
+    """Image of a mask (b, 1, y, x), 1 where all is open; cut by the reach of the kernels."""
+    reach = kernel_reach_px(optics, pitch_um)
+    ny, nx = transmission.shape[-2:]
+    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
+    # A transform spreads its roundings over the field: in double precision a tile prints what the whole does.
+    image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
+    return image.to(transmission.dtype)
+
+
+def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
+    """Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the kernels.
+
+    The mask is transformed once, and back with all kernels in one batch.
+    """
+    amplitudes = torch.fft.ifft2(torch.fft.fft2(transmission) * spectra)
+    return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
+
+
+def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
+    """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
+
+    Source points lie on the grid of the field's frequencies.
+
+    Raises:
+        InputError: a ring between two of them.
+    """
+    fy, fx = (np.fft.fftfreq(n, pitch_um) for n in shape)
+    y, x = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
+    cutoff = optics.na / optics.wavelength_um
+    radius = np.hypot(y, x) / cutoff
+    source = np.flatnonzero((radius <= optics.outer + 1e-9) & (radius >= optics.inner - 1e-9))
+    if not len(source):
+        raise InputError(
+            "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
+        )
+    # What no source point brings into the pupil is dark in all kernels.
+    bright = np.flatnonzero(radius <= 1 + optics.outer + 1e-9)
+    shifted = y[source, None] + y[bright], x[source, None] + x[bright]
+    waves = _pupil(*shifted, optics)
+    values, vectors = np.linalg.svd(waves, full_matrices=False)[1:]
+    open_frame = np.sum(np.abs(waves[:, bright == 0]) ** 2)
+    count = min(optics.kernels, len(values))
+    found = np.zeros((count, len(y)), np.complex128)
+    found[:, bright] = values[:count, None] * vectors[:count] / np.sqrt(open_frame)
+    return found.reshape(count, *shape)
+
+
+def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
+    """Amplitude that passes the pupil, with the phase of a defocus."""
+    squared = (fy**2 + fx**2) * optics.wavelength_um**2
+    inside = squared <= optics.na**2 * (1 + 1e-9)
+    along = np.sqrt(np.where(inside, 1 - squared, 1.0)) - 1
+    return inside * np.exp(2j * math.pi * optics.defocus_um / optics.wavelength_um * along)
+
+
+@lru_cache(maxsize=2)
+def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
+    """Transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
+    kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
+    reach = size_px // 2
+    placed = np.zeros((len(kernels), ny, nx), np.complex128)
+    placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
+    placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
+    # A mask that is open everywhere is 1, with as many kernels as there are.
+    spectra = np.fft.fft2(placed)
+    spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
+    return torch.from_numpy(spectra)

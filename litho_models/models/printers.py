@@ -1,0 +1,157 @@
+"""Printers made of parts: one model, and its settings for several machines."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from litho_models.layers.ranges import Range
+from litho_models.models.parts import Number, Part, part_of
+from litho_models.simulator import Simulator, SimulatorConfig, Variant
+
+
+class PrinterConfig(SimulatorConfig):
+    """The parts in their order, and where their numbers are or start, ``part.number`` to value.
+
+    A number may be set like a field of its own: ``spot.sigma_um``.
+    """
+
+    parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names, as the light goes")
+    numbers: dict[str, float] = Field({}, description="those that do not start where the part says")
+
+    @classmethod
+    def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
+        """As of every model, with numbers among the fields."""
+        own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
+        own |= {name: value for name, value in fields.items() if "." in name}
+        parts = fields.get("parts", cls.model_fields["parts"].default)
+        own = {name: value for name, value in own.items() if name in fields or name.split(".")[0] in parts}
+        kept = {name: value for name, value in fields.items() if "." not in name}
+        return super().of_variant(variant, **{**kept, "numbers": own})
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Self:
+        known = {name: number for _, name, number in self.all_numbers()}
+        if len(set(self.parts)) < len(self.parts):
+            raise ValueError("a part is named twice")
+        for name, value in self.numbers.items():
+            if name not in known:
+                raise ValueError(f"{name} is no number of these parts; there are {', '.join(known)}")
+            upper = known[name].range_at(name, value).upper
+            if not known[name].lower <= value <= upper:
+                raise ValueError(f"{name} is {value:g}, not within {known[name].lower:g} to {upper:g}")
+        return self
+
+    def all_numbers(self) -> list[tuple[Part, str, Number]]:
+        """Every number of every part, with its name."""
+        found = map(part_of, self.parts)
+        return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
+
+
+class Printer(Simulator):
+    """H = H₀ · (…part₂(part₁(M / H₀))), see ``parts``."""
+
+    name = "printer"
+    Config = PrinterConfig
+    config: PrinterConfig
+
+    def __init__(self, config: PrinterConfig):
+        super().__init__(config)
+        for _, name, number in config.all_numbers():
+            if number.fitted:
+                key, start = _key(name), config.numbers.get(name, number.start)
+                self.register_parameter(key, nn.Parameter(self.ranges[key].raw(start)))
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        given = self.config.numbers
+        return {
+            _key(name): number.range_at(name, given.get(name, number.start))
+            for _, name, number in self.config.all_numbers()
+            if number.fitted
+        }
+
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """The fitted values by name, ``part.number``."""
+        return {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
+
+    @property
+    def reach_px(self) -> int:
+        return sum(part.reach_px(values, self.pitch_um) for part, values in self._chain())
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        field = layout_um / self.config.full_height_um
+        for part, values in self._chain():
+            field = part.apply(field, values, self.pitch_um)
+        return self.config.full_height_um * field
+
+    def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
+        """The parts, each with its values by their names within it; what is not fitted is a plain number."""
+        known = {**self.config.numbers, **self.values}
+        found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}
+        for part, name, number in self.config.all_numbers():
+            found[part.name][name.partition(".")[2]] = known.get(name, number.start)
+        return [(part_of(name), values) for name, values in found.items()]
+
+
+def _key(name: str) -> str:
+    """Of a number among parameters, whose names take no full stop."""
+    return f"raw_{name.replace('.', '__').replace('-', '_')}"
+
+
+class ElectronBeamConfig(PrinterConfig):
+    parts: tuple[str, ...] = ("two-spots", "hill", "diffusion", "etch")
+    numbers: dict[str, float] = Field(
+        {
+            "two-spots.sigma_um": 0.02,
+            "two-spots.back_um": 0.06,
+            "diffusion.sigma_um": 0.008,
+        }
+    )
+    fixed: tuple[str, ...] = ("etch.threshold",)
+
+
+class ElectronBeam(Printer):
+    """A film written by electrons, some of which come back, and etched."""
+
+    name = "e-beam"
+    Config = ElectronBeamConfig
+
+
+class ProjectionConfig(PrinterConfig):
+    parts: tuple[str, ...] = ("lens", "diffusion", "etch")
+    numbers: dict[str, float] = Field({"diffusion.sigma_um": 0.05, "etch.threshold": 0.25})
+
+
+class Projection(Printer):
+    """A film exposed through a projection lens with a partially coherent source, and etched."""
+
+    name = "projection"
+    Config = ProjectionConfig
+
+
+class LaserWriterConfig(PrinterConfig):
+    parts: tuple[str, ...] = ("spot", "contrast-curve", "transfer")
+    numbers: dict[str, float] = Field({"spot.sigma_um": 0.25})
+
+
+class LaserWriter(Printer):
+    """A relief written by a laser of many levels into resist with a contrast curve."""
+
+    name = "laser-writer"
+    Config = LaserWriterConfig
+
+
+class DmdGrayscaleConfig(PrinterConfig):
+    parts: tuple[str, ...] = ("spot", "tanh", "diffusion", "transfer")
+    numbers: dict[str, float] = Field({"spot.sigma_um": 0.3, "diffusion.sigma_um": 0.1, "tanh.contrast": 1.0})
+
+
+class DmdGrayscale(Printer):
+    """A relief exposed by micromirrors in many levels, in resist that spreads its dose."""
+
+    name = "dmd-grayscale"
+    Config = DmdGrayscaleConfig

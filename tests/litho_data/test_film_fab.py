@@ -1,0 +1,88 @@
+"""The fab for films: where edges lie by its knobs, and a run that is built like any other."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from litho_data import build_dataset, open_store
+from litho_data.cli.app import main
+from litho_data.foundation.errors import InputError
+from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, edge_distance_px, film_knobs, micrograph
+
+BEAM, LENS = FILM_PRINTERS["e-beam"], FILM_PRINTERS["projection"]
+PLAIN = FilmKnobs()
+
+
+def stripes(width_px: int = 32, size_px: int = 128) -> np.ndarray:
+    """Film and ground in turn, each so wide."""
+    return np.tile(np.arange(size_px) // width_px % 2, (size_px, 1))
+
+
+def film_width_px(distance_px: np.ndarray, count: int = 2) -> float:
+    """Mean width of so many stripes of film, in pixels of the layout."""
+    return float(np.mean(distance_px > 0)) * distance_px.shape[1] / 4 / count
+
+
+@pytest.mark.parametrize("knobs", [PLAIN, FilmKnobs(diffusion_um=0.02), FilmKnobs(backscatter=0.3)])
+def test_half_the_dose_leaves_straight_edges_where_they_are(knobs: FilmKnobs) -> None:
+    # As much film as ground: the symmetry of both keeps the edge, to a quarter of a pixel.
+    assert film_width_px(edge_distance_px(stripes(), BEAM, knobs)) == pytest.approx(32, abs=0.26)
+
+
+def test_a_bias_and_a_dose_move_edges_by_what_they_say() -> None:
+    wide = edge_distance_px(stripes(), BEAM, FilmKnobs(etch_bias_um=0.008))
+    # Places are a quarter of a pixel apart, on each side.
+    assert film_width_px(wide) == pytest.approx(32 + 2 * 2, abs=0.51)
+    # A step blurred by 5 px is 0.5 / 1.2 of its height so far out: that quantile of a Gaussian.
+    dosed = edge_distance_px(stripes(), BEAM, FilmKnobs(dose_error=0.2))
+    assert film_width_px(dosed) == pytest.approx(32 + 2 * 5 * 0.2104, abs=0.51)
+
+
+def test_a_lens_sees_a_wide_edge_at_a_quarter_of_the_light_and_defocus_rounds() -> None:
+    coherent = replace(LENS, source=1e-6, threshold=0.25)
+    assert film_width_px(edge_distance_px(stripes(), coherent, PLAIN)) == pytest.approx(32, abs=0.51)
+    island = np.zeros((64, 64))
+    island[28:36, 28:36] = 1
+    sharp, blurred = (edge_distance_px(island, LENS, FilmKnobs(defocus_um=z)) for z in (0.0, 1.5))
+    assert (blurred > 0).sum() < (sharp > 0).sum()
+
+
+def test_a_micrograph_has_a_bright_rim_and_charges() -> None:
+    distance = edge_distance_px(stripes(), BEAM, PLAIN)
+    grey = micrograph(distance, PLAIN, np.random.default_rng(0)).astype(float)
+    rim = (distance > 0.5) & (distance < 1.5)
+    assert grey[rim].mean() > grey[distance > 8].mean() > grey[distance < -1].mean()
+    charged = micrograph(distance, FilmKnobs(charging=0.3), np.random.default_rng(0)).astype(float)
+    assert charged[:, -128:].mean() > 1.3 * charged[:, :128].mean()
+
+
+def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = "simulate --preset e-beam --count 2 --size-px 160 --knob etch_bias_um=0.004 --out"
+    monkeypatch.setattr("sys.argv", ["litho-data", *words.split(), str(tmp_path / "fab")])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    truth = json.loads((tmp_path / "fab" / "truth" / "films.json").read_text())
+    assert truth["knobs"]["etch_bias_um"] == 0.004
+    build_dataset(tmp_path / "fab" / "raw" / "card.toml", tmp_path / "films.zarr")
+    for scan in open_store(tmp_path / "films.zarr").scans():
+        distance = np.load(tmp_path / "fab" / "truth" / f"{scan.id}.npy")
+        share = (distance > 0).reshape(160, 4, 160, 4).mean(axis=(1, 3))
+        # The contour lies a fraction of a pixel off on the flank of its rim: where edges are, some percent.
+        off = np.abs(scan.height_um / BEAM.film_um - share)[scan.usable]
+        assert off.mean() < 0.05
+        assert scan.usable.mean() > 0.8
+
+
+def test_knobs_that_there_are_not_are_refused() -> None:
+    assert film_knobs(["backscatter=0.2"]).backscatter == 0.2
+    for word, said in {"tilt=1": "tilt", "backscatter=much": "a number", "backscatter": "a number"}.items():
+        with pytest.raises(InputError, match=said):
+            film_knobs([word])

@@ -1,0 +1,205 @@
+"""Printers of parts: imaging against the sum of Hopkins and its limits, resists, numbers set or fixed."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_models import load_frozen
+from litho_models.cli.app import main
+from litho_models.fitting.small_models import fit_small_model
+from litho_models.models import MODELS, build_model, fixed_numbers
+from litho_models.models.hopkins import Optics, imaged, intensity, kernel_reach_px, transfer_functions
+from litho_models.models.parts import PARTS, Number, Part, contrast_curve, register_part
+from litho_models.models.printers import Printer
+from tests.litho_models.prints import make_scans, write_store
+
+pytestmark = pytest.mark.numerics
+PITCH_UM, SIZE_PX = 0.05, 24
+LENS = Optics(0.365, 0.6, 0.7, 0.3, 0.4, 400)
+CUTOFF = LENS.na / LENS.wavelength_um
+
+
+def printer(name: str, **fields: Any) -> Printer:
+    model = build_model(name, **fields)
+    assert isinstance(model, Printer)
+    return model
+
+
+def image(mask: np.ndarray, lens: Optics, pitch_um: float = PITCH_UM) -> np.ndarray:
+    """Intensity (y, x) of a periodic mask by all kernels."""
+    spectra = torch.from_numpy(transfer_functions(lens, pitch_um, mask.shape))
+    return imaged(torch.from_numpy(mask)[None, None], spectra)[0, 0].numpy()
+
+
+def hopkins_sum(mask: np.ndarray, lens: Optics) -> np.ndarray:
+    """Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with C summed over the source point by point."""
+    n = len(mask)
+    f = np.stack(np.meshgrid(*2 * [np.fft.fftfreq(n, PITCH_UM)], indexing="ij"), -1).reshape(-1, 2)
+    spectrum = np.fft.fft2(mask).ravel() / mask.size
+
+    def pupil(at: np.ndarray) -> np.ndarray:
+        sine2 = lens.wavelength_um**2 * (at**2).sum(-1)
+        passed = sine2 <= lens.na**2 * (1 + 1e-9)
+        path_um = lens.defocus_um * (np.sqrt(np.where(passed, 1 - sine2, 1)) - 1)
+        return passed * np.exp(2j * np.pi * path_um / lens.wavelength_um)
+
+    radius = np.hypot(*f.T) / CUTOFF
+    source = f[(radius <= lens.outer + 1e-9) & (radius >= lens.inner - 1e-9)]
+    cross = sum(np.outer(pupil(f + s), pupil(f + s).conj()) for s in source)
+    cross /= sum(np.abs(pupil(s)) ** 2 for s in source)
+    places = PITCH_UM * np.stack(np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), -1).reshape(-1, 2)
+    waves = np.exp(2j * np.pi * places @ f.T) * spectrum
+    return np.einsum("xi,ij,xj->x", waves, cross, waves.conj()).real.reshape(n, n)
+
+
+def test_the_kernels_give_the_sum_of_hopkins() -> None:
+    mask = np.random.default_rng(0).random((SIZE_PX, SIZE_PX))
+    assert np.abs(image(mask, LENS) - hopkins_sum(mask, LENS)).max() < 1e-6
+    few = image(mask, LENS._replace(kernels=3))
+    assert 1e-6 < np.abs(few - image(mask, LENS)).max() < 0.1
+
+
+@pytest.mark.parametrize("waves", [1, 3])
+def test_a_point_source_images_the_amplitude_that_passes(waves: int) -> None:
+    """t = (1 + cos 2πfx) / 2 is imaged as t², with its waves late by a defocus; beyond the pupil as 1/4."""
+    lens = Optics(0.365, 0.6, 0.0, 0.0, 0.3, 400)
+    x = np.arange(SIZE_PX) / SIZE_PX
+    f = waves / (SIZE_PX * PITCH_UM)
+    assert (f < CUTOFF) == (waves == 1)
+    phase = 2 * np.pi * lens.defocus_um / lens.wavelength_um * (np.sqrt(1 - min(1, (0.365 * f) ** 2)) - 1)
+    passed = float(f < CUTOFF) * np.exp(1j * phase)
+    wanted = np.abs(0.5 + 0.5 * passed * np.cos(2 * np.pi * waves * x)) ** 2
+    mask = np.tile(0.5 + 0.5 * np.cos(2 * np.pi * waves * x), (SIZE_PX, 1))
+    assert np.allclose(image(mask, lens), wanted, atol=1e-12)
+
+
+def test_a_wide_source_images_the_intensity_by_the_transfer_function_of_a_circular_pupil() -> None:
+    size, waves = 64, 5
+    f = waves / (size * PITCH_UM)
+    # All that the mask diffracts is met by the source: the image is incoherent.
+    lens = Optics(0.365, 0.6, 1 + f / CUTOFF, 0.0, 0.0, 10**6)
+    x = np.arange(size) / size
+    mask = np.tile(np.cos(np.pi * waves * x) ** 2, (size, 1))
+    seen = image(mask, lens)[0]
+    squared = np.abs(np.fft.fft(mask[0] ** 2))
+    ν = f / (2 * CUTOFF)
+    wanted = 2 / np.pi * (np.arccos(ν) - ν * np.sqrt(1 - ν**2))
+    found = np.abs(np.fft.fft(seen))
+    # Frequencies are counted: of a pupil 8 of them wide the area is known to 1 / 8² and its rim.
+    assert found[waves] / found[0] == pytest.approx(wanted * squared[waves] / squared[0], rel=0.03)
+
+
+def test_the_gradient_of_an_image_is_its_difference_quotient() -> None:
+    spectra = torch.from_numpy(transfer_functions(LENS._replace(kernels=8, inner=0.0), PITCH_UM, (12, 14)))
+    mask = torch.rand(1, 1, 12, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(lambda own: imaged(own, spectra), mask.requires_grad_())
+
+
+def test_a_field_is_imaged_as_its_part_is_and_an_open_mask_is_bright() -> None:
+    lens = LENS._replace(kernels=12)
+    reach = kernel_reach_px(lens, PITCH_UM)
+    mask = (torch.rand(1, 1, 2 * reach + 40, 2 * reach + 30) > 0.5).float()
+    whole, part = (intensity(one, lens, PITCH_UM) for one in (mask, mask[..., 10:, :-4]))
+    assert whole.shape[-2:] == (40, 30)
+    assert torch.allclose(whole[..., 10:, :-4], part, atol=1e-5)
+    assert torch.allclose(intensity(torch.ones_like(mask), lens, PITCH_UM), torch.ones(40, 30), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_one_batch_of_kernels_is_faster_than_one_convolution_after_the_other() -> None:
+    lens = LENS._replace(kernels=12)
+    size = 1024
+    kernels = torch.fft.ifft2(torch.from_numpy(transfer_functions(lens, PITCH_UM, (64, 64))))
+    spectra = torch.fft.fft2(kernels, s=(size, size)).to(torch.complex64)
+    mask = torch.rand(1, 1, size, size)
+
+    def one_by_one() -> torch.Tensor:
+        amplitudes = [
+            torch.fft.ifft2(torch.fft.fft2(mask) * torch.fft.fft2(own, s=(size, size))) for own in kernels
+        ]
+        return sum((one.abs() ** 2 for one in amplitudes), torch.zeros(()))
+
+    def seconds(run: object) -> float:
+        started = time.process_time()
+        run()  # type: ignore[operator]
+        return time.process_time() - started
+
+    assert torch.allclose(imaged(mask, spectra), one_by_one().float(), rtol=1e-3, atol=1e-4)
+    assert min(seconds(lambda: imaged(mask, spectra)) for _ in range(3)) < seconds(one_by_one)
+
+
+def test_a_contrast_curve_is_a_line_in_the_logarithm_between_nothing_and_all() -> None:
+    dose = torch.tensor([0.05, 0.4, 0.6, 2.0])
+    depth = contrast_curve(dose, torch.tensor(1.5), torch.tensor(0.9))
+    # Corners are rounded by 1 / 20 of the depth.
+    wanted = [0.0, 1 + 1.5 * np.log10(0.4 / 0.9), 1 + 1.5 * np.log10(0.6 / 0.9), 1.0]
+    assert depth.tolist() == pytest.approx(wanted, abs=0.01)
+
+
+def test_every_part_states_its_source_and_numbers_within_their_range() -> None:
+    for part in PARTS.values():
+        assert part.source
+        for name, number in part.numbers.items():
+            own = number.range_at(name, number.start)
+            assert own.lower <= number.start <= own.upper
+
+
+def test_a_part_of_ones_own_is_a_stage_of_a_printer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
+    numbers = {"gain": Number(0.5)}
+    register_part(Part("gain", "transfer", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
+    model = printer("laser-writer", parts=("spot", "gain"))
+    assert set(model.values) == {"spot.sigma_um", "gain.gain"}
+    flat = torch.full((1, 1, 40, 40), 0.8)
+    assert torch.allclose(model(flat), torch.full_like(flat, 0.4))
+    with pytest.raises(InputError, match="not taken"):
+        register_part(PARTS["etch"])
+
+
+def test_a_fixed_number_stays_and_a_freed_one_does_not() -> None:
+    scans = make_scans(2, 64)
+    geometry = {"pitch_um": 0.1, "levels": 13, "level_height_um": 0.1}
+    for fixed in ((), ("spot.sigma_um",)):
+        model = printer("laser-writer", **geometry, **{"spot.sigma_um": 0.4}, fixed=fixed)
+        fit_small_model(model, scans, "none")
+        values = {name: value.item() for name, value in model.values.items()}
+        assert (values["spot.sigma_um"] == pytest.approx(0.4)) == bool(fixed)
+        assert values["transfer.selectivity"] != pytest.approx(1.0)
+    assert fixed_numbers("e-beam", ["etch.bias_px"], ["etch.threshold"]) == ["etch.bias_px"]
+    with pytest.raises(InputError, match="to fix"):
+        build_model("physics", fixed=("nonsense",))
+    with pytest.raises(InputError, match="fixed number"):
+        fixed_numbers("physics", free=["eta"])
+
+
+def test_numbers_of_a_model_are_set_and_fixed_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = write_store(tmp_path / "made.zarr", make_scans(3, 64))
+    words = ["train", store, "--model", "laser-writer", "--out", tmp_path / "run"]
+    words += ["--set", "spot.sigma_um=0.35", "--fix", "spot.sigma_um"]
+    monkeypatch.setattr("sys.argv", ["litho-models", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    settings = json.loads((tmp_path / "run" / "run.json").read_text())["config"]["model"]
+    assert settings == {"spot.sigma_um": 0.35, "fixed": ["spot.sigma_um"]}
+    model = load_frozen(tmp_path / "run" / "model").simulator
+    assert isinstance(model, Printer)
+    assert float(model.values["spot.sigma_um"].detach()) == pytest.approx(0.35)
+
+
+@pytest.mark.parametrize("name", [name for name, one in MODELS.items() if issubclass(one, Printer)])
+def test_a_preset_is_built_for_its_own_pitch_and_says_what_it_does_not_know(name: str) -> None:
+    with pytest.raises(InputError, match="no number"):
+        printer(name, **{"spot.width_um": 1.0})
+    with pytest.raises(InputError, match="part of a printer"):
+        build_model(name, parts=("lamp",))

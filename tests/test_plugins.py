@@ -1,0 +1,145 @@
+"""Plug-ins: a package that pip installed, or a file, is known to every command and in every worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from operator import methodcaller
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from examples.own_reader import write_toy
+from litho_data.foundation import plugins
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_facts
+from litho_data.sharing.workers import Workers, run_jobs
+from tests.litho_models.prints import make_scans, write_store
+
+ROOT = Path(__file__).parents[1]
+PROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+[project]
+name = "own-lab"
+version = "1.2"
+[project.entry-points."litholoop.plugins"]
+own-lab = "own_lab"
+[tool.setuptools]
+py-modules = ["own_lab"]
+"""
+MODULE = """
+from examples.own_effect import register
+from examples.own_metric import share_off_by_half_a_level
+from examples.own_reader import TOY
+from examples.own_simulator import TwoSpots
+from litho_data.readers import register_reader
+from litho_models import register_metric, register_simulator
+import examples.own_task
+
+register()
+register_reader(TOY)
+register_simulator(TwoSpots)
+register_metric("off_by_half_a_level", "percent", share_off_by_half_a_level, "off_by_half_a_level: a share.")
+"""
+# One process for all commands: each of its own would spend its time on imports.
+COMMANDS = """
+import importlib, sys
+def run(*words):
+    sys.argv = [str(word) for word in words]
+    try:
+        importlib.import_module(words[0].replace("-", "_") + ".cli").main()
+    except SystemExit as stop:
+        assert not stop.code, words
+if __name__ == "__main__":
+    loop = "close-loop prints.zarr --base two-spots --folds 2 --workers 2 --out loop"
+    bench = "benchmark prints.zarr --models identity,two-spots --folds 2 --workers 2 --out bench"
+    run("litho-data", "inspect", "scan.afm")
+    run("litho-models", "train", "prints.zarr", "--model", "two-spots", "--out", "run")
+    run("litho-models", "freeze", "run", "--out", "printer")
+    run("litho-models", *bench.split())
+    run("litho-models", *loop.split())
+    hoe = "hoe --model printer --size-px 32 --distance-um 20 --iterations 2 --out hologram"
+    run("litho-design", *hoe.split(), "--set", "search.polish_rounds=0")
+    from litho_design.tasks.task import registered_task
+    print(registered_task("colours-in-planes"))
+"""
+OWN = "class Number(int):\n    def twice(self):\n        return 2 * self\n"
+
+
+@pytest.fixture
+def unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test loads is not loaded for the others."""
+    monkeypatch.setattr(plugins, "_LOADED", {})
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("own_"):
+            del sys.modules[name]
+
+
+@pytest.mark.slow
+def test_what_an_installed_plugin_registers_is_used_by_every_command_and_worker(tmp_path: Path) -> None:
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    (source / "pyproject.toml").write_text(PROJECT)
+    (source / "own_lab.py").write_text(MODULE)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-build-isolation"]
+    subprocess.run([*pip, "--no-deps", "--target", site, source], check=True, timeout=300)
+    write_store(tmp_path / "prints.zarr", make_scans(4, 48))
+    write_toy(tmp_path / "scan.afm", 100 * np.random.default_rng(0).random((32, 32)), (3.2, 3.2))
+    (tmp_path / "commands.py").write_text(COMMANDS)
+    environment = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "commands.py"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "toy" in done.stdout
+    assert "ColoursInPlanes" in done.stdout
+    assert "two-spots" in set(pd.read_csv(tmp_path / "bench" / "scans.csv")["model"])
+    bench = json.loads((tmp_path / "bench" / "benchmark.json").read_text())
+    assert all("off_by_half_a_level_percent" in row["metrics"] for row in bench["scores"])
+    assert bench["run"]["versions"]["plug-in own-lab"] == "1.2"
+    loop = json.loads((tmp_path / "loop" / "close_loop.json").read_text())
+    assert "sinking-layers" in {one["name"] for one in (*loop["candidates"], *loop["effects"])}
+    assert "two-spots" in (tmp_path / "hologram" / "design.json").read_text()
+
+
+def test_a_file_is_loaded_once_and_in_every_worker(tmp_path: Path, unknown: None) -> None:
+    file = tmp_path / "own_numbers.py"
+    file.write_text(OWN)
+    for _ in range(2):
+        plugins.load_plugins([file])
+    numbers = [sys.modules["own_numbers"].Number(one) for one in (1, 2, 3)]
+    done = run_jobs(methodcaller("twice"), numbers, Workers(2))
+    assert sorted(result for _, result in done) == [2, 4, 6]
+    version = run_facts()["versions"]["plug-in own_numbers.py"]
+    file.write_text(f"{OWN}# Changed.\n")
+    plugins._LOADED.clear()
+    del sys.modules["own_numbers"]
+    plugins.load_plugins([file])
+    assert run_facts()["versions"]["plug-in own_numbers.py"] != version
+
+
+def test_a_plugin_that_cannot_be_loaded_is_one_line(tmp_path: Path, unknown: None) -> None:
+    failing, taken = tmp_path / "own_fault.py", tmp_path / "json.py"
+    failing.write_text("1 / 0")
+    taken.write_text("")
+    wrong = {tmp_path / "none.py": "none.py", tmp_path: "a file of Python"}
+    for file, said in {**wrong, failing: "ZeroDivisionError", taken: "a name of its own"}.items():
+        with pytest.raises(InputError, match=said):
+            plugins.load_plugins([file])
+    assert not plugins.plugin_files()
+
+
+def test_the_option_stands_anywhere_on_the_line() -> None:
+    words = ["--plugin", "one.py", "train", "store", "--plugin=two.py", "--model", "m"]
+    assert plugins.without_plugins(words) == (["train", "store", "--model", "m"], ["one.py", "two.py"])
+    with pytest.raises(InputError, match="a file of Python"):
+        plugins.without_plugins(["train", "--plugin"])
