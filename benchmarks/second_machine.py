@@ -1,11 +1,10 @@
 """A second machine, measured: silicon written by electron beam, etched, and seen by an electron microscope.
 
     litho-data build datasets/prefab-soi.toml --out prefab-soi.zarr
-    python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--publish]
+    python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--loop FOLDER] [--publish]
 
-Models are fitted per fold, with whole patterns held out, and judged by their edges. Then a search adds parts
-to a printer of a spot and a threshold: each time the one that improves the held-out edges most, while the
-gain is more than chance. An interrupted run resumes.
+Models are fitted per fold, with whole patterns held out, and judged by their edges. Then the loop is closed
+on the same folds, from a printer of a spot and a threshold. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -26,11 +25,14 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.fitting.fit import common_geometry, fit_with_record
 from litho_models.fitting.runs import training_config
 from litho_models.fitting.small_models import fit_small_model
+from litho_models.loop.record import CloseLoop
+from litho_models.loop.run import close_loop
 from litho_models.models import build_model
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scoring.films import film_edge_um, films_of_scan
 from litho_models.scoring.shapes import edges_of_scan
 from litho_models.scoring.statistics import bootstrap_interval, over_units
+from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold, plan_folds
 
 if TYPE_CHECKING:
@@ -39,9 +41,8 @@ if TYPE_CHECKING:
 PAGE = Path(__file__).parents[1] / "docs" / "second_machine.md"
 RESULT = PAGE.parent / "results" / "second-machine" / "second_machine.json"
 BASELINES = ("identity", "affine", "blur-table")
-PARTS = ("backscatter", "diffusion", "etch bias")
-BASE = "spot and threshold"
-WHOLE = " + ".join((BASE, *PARTS))
+BASE, WHOLE = "spot and threshold", "e-beam"
+BARE: dict[str, Any] = {"parts": ["spot", "etch"], "spot.sigma_um": 0.02, "fixed": ["etch.bias_px"]}
 # A printer of few numbers needs no more patterns than every second; each gives a window of 256 px.
 FITTED_EVERY = 2
 LEARNED: dict[str, dict[str, int]] = {
@@ -50,26 +51,29 @@ LEARNED: dict[str, dict[str, int]] = {
     "pbl": {"steps": 60, "rounds": 1},
     "fno": {"steps": 150, "rounds": 1},
 }
-CHANCE = 0.05
 AROUND_PX = 40
 Row = dict[str, Any]
 
 
 def main() -> None:
-    """Fit, judge, search, write."""
+    """Fit, judge, close the loop, write."""
     parser = options(__doc__, "write the tables into the page", RESULT)
     parser.add_argument("store", type=Path)
     parser.add_argument("--cache", type=Path, default=Path("runs/second-machine"), help="a file per fit")
     parser.add_argument("--learned", default="", help=f"models to learn too, of {', '.join(LEARNED)}")
+    parser.add_argument("--loop", type=Path, help="folder of the loop, closed if it is not there")
     arguments = parser.parse_args()
     store = open_store(arguments.store)
     folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
     bench = Bench(folds, arguments.cache)
-    tables = {name: bench.rows(name) for name in (*BASELINES, BASE)}
-    found, rounds = search(bench)
     learned = [name for name in LEARNED if name in arguments.learned.split(",")]
-    for name in dict.fromkeys((label(found), WHOLE, *learned)):
-        tables[name] = bench.rows(name)
+    tables = {name: bench.rows(name) for name in (*BASELINES, BASE, WHOLE, *learned)}
+    folder = arguments.loop or arguments.cache / "loop"
+    loop = (
+        CloseLoop.read(folder)
+        if (folder / CloseLoop.FILE_NAME).exists()
+        else close_loop(arguments.store, folder, base="e-beam", base_settings=BARE, report=print)
+    )
     record = {
         "run": origin(),
         "dataset": store.dataset_id.model_dump(),
@@ -77,13 +81,11 @@ def main() -> None:
         "fitted_every": FITTED_EVERY,
         "learned": {name: LEARNED[name] for name in learned},
         "models": [summary(name, rows, bench.values(name)) for name, rows in tables.items()],
-        "rounds": rounds,
-        "found": list(found),
-        "found_against_whole": compared(tables[label(found)], tables[WHOLE]),
+        "loop": of_loop(loop, tables[WHOLE], store.scan(tables[BASE][0]["scan"]).pitch_um),
         "rows": tables,
     }
     if arguments.publish:
-        draw_places(store, bench, label(found)).savefig(arguments.out.with_name("places.png"), dpi=110)
+        draw_places(store, bench, WHOLE).savefig(arguments.out.with_name("places.png"), dpi=110)
     conclude(record, text_of(record), arguments.out, PAGE, "second machine", published=arguments.publish)
 
 
@@ -107,7 +109,7 @@ class Bench:
         """Fitted values, and the figures of the held-out patterns."""
         file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
         if not file.exists():
-            bare = self.fit(BASE, fold)["values"] if name.startswith(f"{BASE} +") else {}
+            bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
             write_record(file, fit_and_judge(name, fold, bare))
         return json.loads(file.read_text(encoding="utf-8"))
 
@@ -119,15 +121,13 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
     counts.
     """
     geometry = common_geometry(fold.training)
-    printer = name.startswith(BASE)
-    fields = fields_of(name) if printer else {}
     if name in LEARNED:
         config = training_config("fast", name, {"nuisance": "none", **LEARNED[name]})
         model = fit_with_record(name, fold.training, config).model
     else:
         fits = []
-        for start in ({}, started(fields["parts"], bare)) if bare else ({},):
-            model = build_model("e-beam" if printer else name, **{**fields, **start}, **geometry)
+        for start in ({}, started(bare)) if bare else ({},):
+            model = made(name, start, **geometry)
             losses = fit_small_model(model, fold.training[::FITTED_EVERY], "none")
             fits.append((losses[-1] if losses else 0.0, model))
         model = min(fits, key=lambda one: one[0])[1]
@@ -135,24 +135,15 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
     return {"values": values, "rows": [judged(scan, predict_scan(model, scan)) for scan in fold.held_out]}
 
 
-def fields_of(name: str) -> dict[str, Any]:
-    """What makes a printer of the parts in its name: stages, where the spot starts, what is not fitted."""
-    added = name.split(" + ")[1:]
-    spot = "two-spots" if "backscatter" in added else "spot"
-    resist = ("hill", "diffusion") if "diffusion" in added else ()
-    fixed = [*(["etch.threshold"] if resist else []), *([] if "etch bias" in added else ["etch.bias_px"])]
-    return {"parts": (spot, *resist, "etch"), f"{spot}.sigma_um": 0.02, "fixed": fixed}
+def made(name: str, values: Mapping[str, Any], **geometry: Any) -> Simulator:
+    """A model of the table, unfitted, with these numbers."""
+    fields = {**BARE, **values} if name == BASE else values
+    return build_model("e-beam" if name == BASE else name, **geometry, **fields)
 
 
-def started(parts: Sequence[str], bare: Mapping[str, float]) -> dict[str, float]:
-    """Where a printer of these parts starts that begins as the bare one ended."""
-    threshold = "hill" if "hill" in parts else "etch"
-    return {f"{parts[0]}.sigma_um": bare["spot.sigma_um"], f"{threshold}.threshold": bare["etch.threshold"]}
-
-
-def held_out_print(name: str, values: Mapping[str, Any], scan: PrintedScan) -> np.ndarray:
-    """The film (ny, nx), µm, that a printer of these fitted values expects of a pattern."""
-    return predict_scan(build_model("e-beam", **fields_of(name), **values, **common_geometry([scan])), scan)
+def started(bare: Mapping[str, float]) -> dict[str, float]:
+    """Where the printer of all parts starts that begins as the bare one ended."""
+    return {"two-spots.sigma_um": bare["spot.sigma_um"], "hill.threshold": bare["etch.threshold"]}
 
 
 def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
@@ -170,29 +161,23 @@ def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
     }
 
 
-def search(bench: Bench) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
-    """Parts added one by one: the best, if its gain is more than chance for so many tried."""
-    found: tuple[str, ...] = ()
-    rounds = []
-    while left := [part for part in PARTS if part not in found]:
-        before = bench.rows(label(found))
-        tried = {part: compared(before, bench.rows(label((*found, part)))) for part in left}
-        best = max(left, key=lambda part: tried[part]["gain_nm"])
-        taken = tried[best]["gain_nm"] > 0 and tried[best]["p"] * len(left) <= CHANCE
-        one = {"before": label(found), "tried": tried, "added": best if taken else None}
-        if rivals := sorted(set(left) - {best}, key=lambda part: tried[part]["gain_nm"]):
-            first, second = (bench.rows(label((*found, part))) for part in (best, rivals[-1]))
-            one |= {"rival": rivals[-1], "best_over_rival": compared(second, first)}
-        rounds.append(one)
-        if not taken:
-            break
-        found = (*found, best)
-    return found, rounds
-
-
-def label(parts: Sequence[str]) -> str:
-    """A printer by its parts; they are listed in one order, however they were found."""
-    return " + ".join((BASE, *(part for part in PARTS if part in parts)))
+def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str, Any]:
+    """What the loop found, edges before and after, and the corrected printer against one of all parts."""
+    before, after = loop.error("base"), loop.error("all")
+    assert before is not None
+    assert after is not None
+    edges = [{"scan": one, "edge_mean_nm": nm} for one, nm in sorted(after.edge_by_scan_nm.items())]
+    return {
+        "run": loop.run.model_dump(mode="json"),
+        "settings": loop.settings,
+        "pitch_um": pitch_um,
+        "verdict": loop.verdict,
+        "effects": [one.model_dump(mode="json") for one in loop.effects],
+        "candidates": [one.model_dump(mode="json") for one in loop.candidates],
+        "edges_nm": [before.leading_nm, after.leading_nm],
+        "gain": loop.over_scans.model_dump(mode="json"),
+        "whole_over_corrected": compared(edges, whole),
+    }
 
 
 def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
@@ -235,7 +220,7 @@ def draw_places(store: Store, bench: Bench, name: str) -> Figure:
         film = scan.height_um[window]
         axes.imshow(film, cmap="Greys_r", alpha=0.5)
         edge = film_edge_um(scan)
-        printed = held_out_print(name, values[scan.id], scan)[window]
+        printed = predict_scan(made(name, values[scan.id], **common_geometry([scan])), scan)[window]
         for one, colour, style in (
             (scan.layout_um[window], "#4a74b0", ":"),
             (film, "#111111", "-"),
@@ -315,17 +300,21 @@ def text_of(record: Mapping[str, Any]) -> str:
         )
         for one in record["models"]
     ]
-    steps = [
+    loop = record["loop"]
+    found = [
         (
-            *(step["before"], part, "{:+.3f} nm ({:+.3f} … {:+.3f})".format(one["gain_nm"], *one["ci95_nm"])),
-            *("{} of {}".format(*one["better"]), f"{one['p']:.4f}"),
-            "yes" if part == step["added"] else "no",
+            one["name"],
+            ", ".join(f"{key} {own[0]['value']:.3g}" for key, own in one["strengths"].items()),
+            f"{one['gain_nm2']:.1f} of {one['before_nm2']:.0f} nm²",
+            "{} of {}".format(*one["scans_improved"]),
+            f"added, {one['verdict']}",
         )
-        for step in record["rounds"]
-        for part, one in step["tried"].items()
+        for one in loop["effects"]
     ]
-    loop_heads = ("to", "part", "gain at held-out edges", "patterns improved", "p", "added")
-    return f"{markdown_table(heads, rows)}\n\n{markdown_table(loop_heads, steps)}"
+    found += [(one["name"], "", "", "", f"{one['verdict']}: {one['reason']}") for one in loop["candidates"]]
+    edges = "Edges of held-out patterns: {:.2f} nm before, {:.2f} nm after.".format(*loop["edges_nm"])
+    loop_heads = ("cause", "size", "gain, squared error", "patterns improved", "verdict")
+    return f"{markdown_table(heads, rows)}\n\n{markdown_table(loop_heads, found)}\n\n{edges}"
 
 
 if __name__ == "__main__":

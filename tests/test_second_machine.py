@@ -1,35 +1,40 @@
-"""The second machine: what its search adds, and that the page shows what was measured."""
+"""The second machine: how printers are compared, and that the page shows what was measured."""
 
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.record import published
-from benchmarks.second_machine import BASE, PAGE, PARTS, RESULT, Bench, label, search, text_of
+from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, made, started, text_of
+from litho_models.models.printers import Printer
+
+GEOMETRY: dict[str, Any] = {"pitch_um": 0.004, "levels": 17, "level_height_um": 0.01375}
 
 
-class Planted(Bench):
-    """A printer whose edges gain so many nm, of 12 patterns, by each of its parts; scatter 0.05 nm."""
-
-    def __init__(self, gain_nm: dict[str, float]):
-        self._gain_nm = gain_nm
-
-    def rows(self, name: str) -> list[dict[str, object]]:
-        parts = name.split(" + ")[1:]
-        scatter = np.random.default_rng(len(name)).normal(0, 0.05, 12)
-        left = 3 - sum(self._gain_nm.get(part, 0.0) for part in parts)
-        return [{"scan": f"P{i}", "edge_mean_nm": left + one} for i, one in enumerate(scatter)]
+def test_a_gain_in_every_pattern_is_no_chance_and_none_is() -> None:
+    scatter = np.random.default_rng(0).normal(0, 0.05, 12)
+    before = [{"edge_mean_nm": 3 + one} for one in scatter]
+    better = compared(before, [{"edge_mean_nm": 2.8 + one / 2} for one in scatter])
+    assert better["gain_nm"] == pytest.approx(0.2 + scatter.mean() / 2)
+    assert better["better"] == [12, 12]
+    assert better["p"] < 0.01
+    assert compared(before, before)["gain_nm"] == 0
 
 
-@pytest.mark.parametrize("planted", [(), ("diffusion",), ("backscatter", "etch bias")])
-def test_the_search_adds_what_the_edges_lack_and_nothing_else(planted: tuple[str, ...]) -> None:
-    found, rounds = search(Planted(dict.fromkeys(planted, 0.4)))
-    assert set(found) == set(planted)
-    assert len(rounds) == min(len(planted) + 1, len(PARTS))
-    assert label(found) == " + ".join((BASE, *(part for part in PARTS if part in planted)))
+def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
+    bare = {"spot.sigma_um": 0.017, "etch.threshold": 0.42}
+    models: list[Any] = [made(BASE, bare, **GEOMETRY), made(WHOLE, started(bare), **GEOMETRY)]
+    assert all(isinstance(model, Printer) for model in models)
+    spots = [models[0].values["spot.sigma_um"].item(), models[1].values["two-spots.sigma_um"].item()]
+    assert spots == pytest.approx([0.017, 0.017])
+    assert models[0].values["etch.threshold"].item() == pytest.approx(0.42)
+    assert models[1].values["hill.threshold"].item() == pytest.approx(0.42)
+    # A bias is no number of the bare one.
+    assert not models[0].raw_etch__bias_px.requires_grad
 
 
 def test_the_page_shows_the_record() -> None:

@@ -205,8 +205,8 @@ class FieldJob:
             yield made("cover", {**place, **film, **sigma, "dirt_px": _DIRT_PX, "edge_px": 0, **aside})
             return
         recipe = dict(self.recipe)
-        if layout is None:
-            # A reference has none.
+        if layout is None or (self.field.use != "dataset" and not np.ptp(held["mask_level"])):
+            # A reference has none, or one that shows nothing by which it could be located.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             yield made("locate", register_params)

@@ -24,6 +24,7 @@ from litho_design.cli.options import (
     measured_source,
     numbers,
 )
+from litho_design.cli.sheet import sheet
 
 if TYPE_CHECKING:
     from litho_design.judging.score import ScoreResult
@@ -35,6 +36,7 @@ app.command()(lens)
 app.command()(correct)
 app.command()(compare)
 app.command()(settings)
+app.add_typer(sheet, name="sheet")
 
 
 @app.command()

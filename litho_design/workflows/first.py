@@ -14,13 +14,17 @@ from litho_design.workflows.compare import compare
 
 # The design for a perfect printer, the model that the other is made through, and a further judge.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
-# Small enough for a minute on two cores, and close enough for its size to draw the letters.
-_SMALL = {
-    "layout.size_px": 256,
-    "optics.distance_um": 25,
-    "search.iterations": 20,
-    "search.polish_rounds": 2,
-}
+
+
+def small_hologram() -> HologramSettings:
+    """Small enough for a minute on two cores, and close enough for its size to draw the letters."""
+    small = {
+        "layout.size_px": 256,
+        "optics.distance_um": 25,
+        "search.iterations": 20,
+        "search.polish_rounds": 2,
+    }
+    return hologram_settings(changes=small)
 
 
 def first(
@@ -47,7 +51,7 @@ def first(
         InputError: what ``compare`` refuses.
     """
     return compare(
-        settings or hologram_settings(changes=_SMALL),
+        settings or small_hologram(),
         {WITHOUT: "none", DESIGNER: f"zoo:{DESIGNER}"},
         out,
         judges={JUDGE: f"zoo:{JUDGE}"},

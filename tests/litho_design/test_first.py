@@ -8,7 +8,7 @@ import pytest
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, first, hologram_settings
 from litho_design.images.targets import load_target, stroke_width_px
-from litho_design.workflows.first import _SMALL
+from litho_design.workflows.first import small_hologram
 
 TINY = {
     "layout.size_px": 64,
@@ -48,7 +48,7 @@ def test_the_width_of_strokes_is_found(width):
 
 def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path, capsys):
     """Strokes against wavelength x distance / side: the first result must not be a picture of failure."""
-    settings = hologram_settings(changes=_SMALL)
+    settings = small_hologram()
     finest_um = settings.optics.wavelength_um * settings.optics.distance_um / settings.layout.size_um
     assert stroke_width_px(load_target("text", settings.layout.size_px).pixels) * 0.1 > 1.2 * finest_um
     square = np.pad(np.ones((12, 12), np.float32), 26)

@@ -1,0 +1,56 @@
+"""`litho-design sheet new` and `read`: one sheet for a lab to print and scan, and what comes back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from litho_design.cli.design import Target
+from litho_design.cli.options import Device, Out
+
+sheet = typer.Typer(help="One sheet of prints: for a lab, and back from it.", no_args_is_help=True)
+
+
+@sheet.command("new")
+def new(
+    out: Out,
+    model: Annotated[
+        str, typer.Option(help="folder of a frozen model, or zoo:NAME: one hologram is designed through it")
+    ] = "zoo:pbl",
+    format: Annotated[
+        Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"],
+        typer.Option(help="of the files for the printer, see docs/export.md"),
+    ] = "stl",
+    target: Target = "text",
+    layouts: Annotated[int, typer.Option(min=6, help="random ones, to learn the printer from")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="of the random layouts")] = 0,
+    device: Device = "cpu",
+) -> None:
+    """Write what a lab needs to print and scan one sheet; an interrupted run in OUT is continued.
+
+    Example: litho-design sheet new --format gwl --out sheet
+    """
+    from litho_design.sheets.new import PAGE, new_sheet
+
+    made = new_sheet(
+        out, model=model, format=format, target=target, layouts=layouts, seed=seed, device=device
+    )
+    typer.echo(f"{len(made.fields)} fields of {made.side_um:g} µm; what to do: {out / PAGE}")
+
+
+@sheet.command("read")
+def read(
+    folder: Annotated[Path, typer.Argument(help="folder of `sheet new`, with the scans", metavar="SHEET")],
+    out: Out,
+    device: Device = "cpu",
+) -> None:
+    """Make of the scans a model of the printer, what it lacks, and a comparison of the two holograms.
+
+    Example: litho-design sheet read sheet --out answer
+    """
+    from litho_design.sheets.read import read_sheet, sheet_text
+
+    typer.echo(sheet_text(read_sheet(folder, out, device=device)))
+    typer.echo(f"model and card: {out / 'printer'}; report: {out / 'report.html'}")

@@ -1,0 +1,139 @@
+"""What comes back of a sheet becomes a dataset, a model with its card, a closed loop and a comparison."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from litho_data import build_dataset
+from litho_data.cards.card import load_card
+from litho_data.commands.progress import say
+from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.run_facts import run_facts
+from litho_data.layouts.card_text import CARD_NAME
+from litho_data.reports.page import Page
+from litho_design.judging.gap import design_folder
+from litho_design.judging.measured import MeasuredSource
+from litho_design.printers.source import Device
+from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, ReadSheet, Sheet
+from litho_design.workflows.score import score
+from litho_models import close_loop, evaluate, freeze
+
+# A sheet has too few scans for more.
+_BASE = "physics"
+
+
+def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
+    """Make of the scans of a sheet a model of the printer, what it lacks, and the hologram's two images.
+
+    Args:
+        sheet: folder of ``new_sheet``, with the scans in it.
+        out: folder of the answer: ``prints.zarr``, ``printer`` (the model and its card), ``loop``,
+            ``evaluation``, a score of each hologram, and ``report.html``. An interrupted run resumes.
+        device: where prints and waves are computed.
+
+    Raises:
+        InputError: no sheet, a hologram without its scan, or what the steps refuse.
+    """
+    source = Path(sheet)
+    given = Sheet.read(source)
+    scans = {arm: _scan_of(source, arm) for arm in ARMS}
+    sha256 = file_sha256(source / Sheet.FILE_NAME)
+    with growing_folder(out, ReadSheet.FILE_NAME, {"sheet_sha256": sha256}) as begun:
+        folder = begun.folder
+        store = folder / "prints.zarr"
+        build_dataset(source / CARD_NAME, store)
+        model = given.settings["model"]
+        evaluated = evaluate(model, store, folder / "evaluation")
+        loop = close_loop(store, folder / "loop", base=_BASE, report=say)
+        freeze(folder / "loop", folder / "printer")
+        base, corrected = loop.error("base"), loop.error("all")
+        assert base is not None
+        assert corrected is not None
+        measured = {}
+        for arm, scan in scans.items():
+            scored = score(
+                design_folder(source / HOLOGRAM, arm, 0), folder / f"score-{arm}", judges=(), scan=scan,
+                device=device,
+            )  # fmt: skip
+            measured[arm] = scored.scores[-1].figures["si_psnr_db"]
+        result = ReadSheet(
+            **run_facts(),
+            sheet_sha256=sha256,
+            dataset=loop.dataset,
+            model=model,
+            model_nm=evaluated.scores.mae_datum_free_nm,
+            own_nm=base.mae_nm,
+            corrected_nm=corrected.mae_nm,
+            found=[one.name for one in loop.effects],
+            verdict=loop.verdict,
+            measured_db=measured,
+            expected_db=given.expected_db,
+        )
+        _write_report(folder, result)
+        result.write(folder)
+    return result
+
+
+def sheet_text(result: ReadSheet) -> str:
+    """The answer in two sentences."""
+    gain = {kind: db["with"] - db["without"] for kind, db in _by_kind(result).items()}
+    better = "better" if gain["measured"] >= 0 else "worse"
+    return (
+        f"Designed through {result.model}, the printed hologram is {abs(gain['measured']):.1f} dB {better} "
+        f"({result.measured_db['with']:.1f} instead of {result.measured_db['without']:.1f} dB; "
+        f"{gain['expected']:+.1f} dB were expected). "
+        f"{result.model} is {result.model_nm:.1f} nm off these prints; the model fitted to them "
+        f"{result.corrected_nm:.1f} nm on scans that it had not seen."
+    )
+
+
+def _scan_of(sheet: Path, arm: Arm) -> MeasuredSource:
+    found = sorted((sheet / SCANS_OF_HOLOGRAMS).glob(f"{arm}.*"))
+    if len(found) != 1:
+        got = ", ".join(path.name for path in found) or "none"
+        raise InputError(f"scan of the hologram {arm}", got=got, wanted=f"{SCANS_OF_HOLOGRAMS}/{arm}.txt")
+    scan = load_card(sheet / CARD_NAME).scan
+    stated = found[0].suffix != ".txt"
+    return MeasuredSource(found[0], None if stated else scan.unit, None if stated else scan.size_um)
+
+
+def _by_kind(result: ReadSheet) -> dict[str, dict[Arm, float]]:
+    return {"expected": result.expected_db, "measured": result.measured_db}
+
+
+def _write_report(folder: Path, result: ReadSheet) -> None:
+    page = Page(
+        "What the sheet says",
+        "A printer learned from one sheet of prints, and one hologram printed twice.",
+        run=result,
+        facts={"dataset": result.dataset.sha256},
+    )
+    page.verdict(sheet_text(result))
+    page.heading("The hologram")
+    rows = [
+        {"image": kind, **{f"{arm} the model, dB": db[arm] for arm in ARMS}}
+        for kind, db in _by_kind(result).items()
+    ]
+    page.table(rows, "SI-PSNR: higher is better", "holograms.csv")
+    page.heading("The printer")
+    errors = [
+        {"model": result.model, "mae_nm": result.model_nm},
+        {"model": f"{_BASE}, fitted to these prints", "mae_nm": result.own_nm},
+        {"model": "the same, with what the loop found", "mae_nm": result.corrected_nm},
+    ]
+    page.table(
+        errors, "mean absolute error, one offset per scan free; scans held out of the fits", "errors.csv"
+    )
+    found = ", ".join(result.found) or "nothing"
+    page.paragraph(f"The loop adds {found}; its verdict: {result.verdict}.")
+    page.links(
+        [
+            ("prints-report/report.html", "Report of the dataset"),
+            ("loop/report.html", "What the model lacks"),
+            ("evaluation/report.html", f"{result.model} on these prints"),
+            *((f"score-{arm}/report.html", f"The hologram {arm} the model") for arm in ARMS),
+        ]
+    )
+    page.write(folder)

@@ -1,0 +1,62 @@
+"""``sheet.json``, what was handed out, and ``read.json``, what came back."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts
+from litho_data.store.schema import DatasetId
+
+Arm = Literal["without", "with"]
+# The same hologram, designed for a perfect printer and through the model.
+ARMS: tuple[Arm, ...] = ("without", "with")
+HOLOGRAM, SCANS_OF_HOLOGRAMS = "hologram", "hologram-scans"
+
+
+class Field(Record):
+    """One field of a sheet: its number in the order of printing, its file and what it is for."""
+
+    order: int
+    id: str
+    file: str
+    what: str
+
+
+class Sheet(RunFacts, Result):
+    """What a lab was given; ``expected_db``: SI-PSNR of the image of each hologram by ``model``."""
+
+    SCHEMA: ClassVar[str] = "litho-design/sheet/1"
+    FILE_NAME: ClassVar[str] = "sheet.json"
+
+    settings: dict[str, Any]
+    side_um: float
+    level_height_um: float
+    levels: int
+    fields: list[Field]
+    expected_db: dict[Arm, float]
+
+
+class ReadSheet(RunFacts, Result):
+    """What the scans of a sheet say.
+
+    Attributes:
+        model_nm: mean absolute error on the new prints of the model that designed; ``own_nm``: of the one
+            fitted to them, by cross-validation in the loop; ``corrected_nm``: with what the loop found.
+        found: effects that the loop added; ``verdict``: of the loop.
+        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: as it was predicted.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-design/sheet-read/1"
+    FILE_NAME: ClassVar[str] = "read.json"
+
+    sheet_sha256: str
+    dataset: DatasetId
+    model: str
+    model_nm: float
+    own_nm: float
+    corrected_nm: float
+    found: list[str]
+    verdict: str
+    measured_db: dict[Arm, float]
+    expected_db: dict[Arm, float]
