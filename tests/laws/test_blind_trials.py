@@ -443,7 +443,8 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
         shape, pitch_um = made.height_um.shape, made.frame.pitch_um
         scans.append(
             SimpleNamespace(
-                id=job.id, shape=shape, scan_to_layout=np.eye(3), pitch_um=pitch_um, bend_um=None, seen_by="afm",
+                id=job.id, shape=shape, scan_to_layout=np.eye(3), pitch_um=pitch_um, bend_um=None,
+                seen_by="afm",
                 height_um=made.height_um.astype(np.float32), usable=np.ones(shape, bool),
             )
         )  # fmt: skip
