@@ -53,7 +53,7 @@ import importlib, sys
 def run(*words):
     sys.argv = [str(word) for word in words]
     try:
-        importlib.import_module(words[0].replace("-", "_") + ".cli").main()
+        importlib.import_module(words[0].replace("-", "_") + ".cli.app").main()
     except SystemExit as stop:
         assert not stop.code, words
 if __name__ == "__main__":

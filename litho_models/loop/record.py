@@ -254,7 +254,7 @@ class CloseLoop(Result):
         held_out: str = "scans",
     ) -> ErrorRow | None:
         """One row of the errors, with the usual terms unless stated; None if it was not measured."""
-        policy = policy or usual_policy(bool(self.errors[0].edge_by_scan_nm))
+        policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)
         return next(rows, None)
