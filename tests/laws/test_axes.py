@@ -209,6 +209,9 @@ def test_an_effect_of_the_exchanged_print_is_the_exchanged_effect(effect: str, n
         if facts.kind == "amplitude" and parameter != "shear_um2"
     }
     field = torch.from_numpy(relief(grid))[None, None]
+    if one.of_films:
+        # A film is there or not.
+        field = 1.2 * (field > field.mean()).to(field)
     (ny, nx), place, corner = grid.shape, (11.0, -23.0), (5, 9)
     here = FieldContext(field, 0.1, 1.2, 0.1, place, 60.0, "y", 0.3, (ny + 30, nx + 17), corner)
     there = FieldContext(
