@@ -1,4 +1,4 @@
-"""How long prediction and design take through the models of the zoo, and in how much memory.
+"""Time and memory of prediction and design with each model of the zoo.
 
     python -m benchmarks.speed [--size-px 256] [--threads 1] [--device cuda] [--publish]
 

@@ -16,7 +16,7 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
-# What a figure is of: scans that the model was trained on, or fits of the same model to fewer scans.
+# How a figure was scored: on the scans of the training, or by fits that had not seen the scan.
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]

@@ -60,7 +60,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
 
 def card(name: str, root: str | Path = ZOO_FOLDER) -> dict[str, Any]:
-    """What the card of a model in the zoo says, by the names of ``ModelCard``; its weights stay unread.
+    """The card of a zoo model as a dictionary, with the keys of ``ModelCard``; the weights are not read.
 
     Raises:
         InputError: no such model.

@@ -1,4 +1,4 @@
-"""A check in plain words, from templates: the verdict, and what its reader should know."""
+"""The text of a check, from templates: the verdict and the notes beside it."""
 
 from collections.abc import Sequence
 from pathlib import Path
