@@ -25,6 +25,7 @@ from litho_design.cli.options import (
     numbers,
 )
 from litho_design.cli.sheet import sheet
+from litho_design.exports.formats import Format
 
 if TYPE_CHECKING:
     from litho_design.judging.score import ScoreResult
@@ -182,9 +183,7 @@ def _print_scores(result: ScoreResult, out: Path) -> None:
 def export(
     design: Annotated[Path, typer.Argument(help="folder of a design, or NAME.npy: levels, or heights in µm")],
     out: Out,
-    format: Annotated[
-        Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"], typer.Option(help="file for the printer")
-    ] = "png16",
+    format: Annotated[Format, typer.Option(help="file for the printer")] = "png16",
     pitch_um: Annotated[float, typer.Option(help="pixel of NAME.npy, µm")] = 0.1,
     level_height_um: Annotated[float, typer.Option(help="level of NAME.npy, µm")] = 0.1,
     pedestal_um: Annotated[float, typer.Option(help="base under level 0, µm")] = 1.0,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
+from litho_design.exports.formats import Format
 
 sheet = typer.Typer(help="One sheet of prints: for a lab, and back from it.", no_args_is_help=True)
 
@@ -19,10 +20,7 @@ def new(
     model: Annotated[
         str, typer.Option(help="folder of a frozen model, or zoo:NAME: one hologram is designed through it")
     ] = "zoo:pbl",
-    format: Annotated[
-        Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"],
-        typer.Option(help="of the files for the printer, see docs/export.md"),
-    ] = "stl",
+    format: Annotated[Format, typer.Option(help="of the files for the printer, see docs/export.md")] = "stl",
     target: Target = "text",
     layouts: Annotated[int, typer.Option(min=6, help="random ones, to learn the printer from")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="of the random layouts")] = 0,

@@ -16,6 +16,7 @@ from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.readers.exported import exported_levels, exported_rows
 from litho_design.elements.element import Element
 from litho_design.exports.dxf import write_dxf
+from litho_design.exports.formats import Format
 from litho_design.exports.gds import GdsLayers, write_gds
 from litho_design.exports.gwl import Gwl, write_gwl
 from litho_design.exports.image import (
@@ -26,7 +27,7 @@ from litho_design.exports.image import (
 )
 from litho_design.exports.marks import Marks, with_marks
 from litho_design.exports.rows import LevelRows, bands_of, layout_rows
-from litho_design.exports.sidecar import Format, Sidecar, of_design, of_layout, read_sidecar, sidecar_path
+from litho_design.exports.sidecar import Sidecar, of_design, of_layout, read_sidecar, sidecar_path
 from litho_design.exports.stl import write_stl
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.layout import LayoutSettings

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
+from litho_design.exports.formats import Format
 from litho_design.exports.gwl import Gwl
 from litho_design.exports.marks import Marks
 from litho_design.optics.stroke import Stroke
@@ -15,9 +16,6 @@ from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord
 from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.design import Design
-
-Format = Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
-
 
 # What a sidecar takes over from the record of its design.
 _OF_DESIGN = ("printer", "stroke", "printability", "out_of_distribution", "predicted", "settings")
