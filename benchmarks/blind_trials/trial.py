@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_models.boards.board import TRIALS, cpu_s, name_of
-from litho_models.boards.judging import failed, judged
+from litho_models.boards.judging import broken, judged
 from litho_models.boards.own_loop import answer_of
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Draw, Draws, Planted, Trial
@@ -72,9 +71,7 @@ def run_trial(
             update={"verdict": result.verdict, "base_model": result.base_model}
         )
     except Exception as error:
-        traceback.print_exc()
-        # Results are published: where they were made must not show.
-        trial = failed(draw, f"{type(error).__name__}: {error}".replace(str(out), "OUT"), planted)
+        trial = broken(draw, error, planted, {out: "OUT"})
     if not keep_data:
         for data in ("raw", "store.zarr", "store-report"):
             shutil.rmtree(folder / data, ignore_errors=True)

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from litho_data.store import open_store
 from litho_data.virtual_fab.jobs import Plan
 from litho_models.boards.draws import draw_board
 from litho_models.boards.figures import make_scoreboard, trial_table
-from litho_models.boards.judging import failed, judged
+from litho_models.boards.judging import broken, judged
 from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
@@ -174,10 +173,7 @@ def _trial(draw: Draw, draws: Draws, board: Path, folder: Path, loop: Loop) -> T
         jobs = trial_jobs(draw, draws.n_scans, draws.size_px)
         return judged(draw, planted, answer, jobs, open_store(store), used_s)
     except Exception as error:
-        traceback.print_exc()
-        # Results are published: where they were made must not show.
-        reason = f"{type(error).__name__}: {error}".replace(str(folder), "OUT").replace(str(board), "BOARD")
-        return failed(draw, reason, planted)
+        return broken(draw, error, planted, {folder: "OUT", board: "BOARD"})
 
 
 def name_of(draw: Draw) -> str:

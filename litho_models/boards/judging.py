@@ -5,7 +5,9 @@ The rules are written down in docs/blind_trials.md, before a board is run.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -195,6 +197,18 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
         return float(np.median([abs(values[name] / own - 1) for name, own in true.items() if name in values]))
 
     return error(answer.base_values), error(answer.corrected_values)
+
+
+def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
+    """The result of a trial that an error ended, which is printed.
+
+    Results are published, so places on this machine are called by their names.
+    """
+    traceback.print_exception(error)
+    reason = f"{type(error).__name__}: {error}"
+    for place, name in places.items():
+        reason = reason.replace(str(place), name)
+    return failed(draw, reason, planted)
 
 
 def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
