@@ -158,13 +158,13 @@ def _chosen(
         lawful = search(named.state, study, laws, 2, secants)
         study.report("describing what is left")
         described = describe(lawful.state, study, tables, 2, secants)
-        if not named.causes:
-            return Chosen(named, failed, lawful, _in_model(lawful.state, described, study))
-        in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
-        left_nm2 = learner().rest(held_out_maps(in_place.per_fold, study, study.scans)).mean_nm2
-        check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
-        checked = [check.of(cause) for cause in named.causes]
-        named.causes = [one.cause for one in checked]
+        checked: list[Checked] = []
+        if named.causes:
+            in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
+            left_nm2 = learner().rest(held_out_maps(in_place.per_fold, study, study.scans)).mean_nm2
+            check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
+            checked = [check.of(cause) for cause in named.causes]
+            named.causes = [one.cause for one in checked]
         # What may only correct another formula goes first: that formula is then judged without it.
         wrong = sorted(
             (one for one in checked if one.reason),
@@ -184,8 +184,7 @@ def _in_model(state: State, described: Sequence[Cause], study: Study) -> Found:
     """The model with every table that is confirmed there too, fitted beside all the rest."""
     found = Found(state)
     for table in described:
-        twin = found.state.twin.with_effect(table.name, table.by, table.values)
-        fitted = fit_state(twin, study, from_here=True)
+        fitted = _with_table(found.state, table, study)
         judgement = judge(found.state.freed_nm2, fitted.freed_nm2, study)
         if judgement.passed(grouped=table.by != ALL):
             found.state = fitted
@@ -201,6 +200,10 @@ def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: floa
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:
         return state
+    return _with_table(state, table, study)
+
+
+def _with_table(state: State, table: Cause, study: Study) -> State:
     return fit_state(state.twin.with_effect(table.name, table.by, table.values), study, from_here=True)
 
 
