@@ -17,8 +17,9 @@ CONFIRM_P = 0.005
 FEWEST_SCANS = 8
 # A strength by group was held against exchanged labels already: half of the scans may have nothing to gain.
 GROUPED_P = 0.05
-# Of the squared error: one percent of its root. The form of a model is always wrong by a little.
-SMALLEST_SHARE = 0.02
+# Of the squared error: what is worth a strength by group, or a search. A change of the model has to take
+# twice that, one percent of the root: its form is always wrong by a little.
+SMALLEST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Judgement:
     @property
     def matters(self) -> bool:
         """Large enough to be of use."""
-        return self.gain_nm2 >= SMALLEST_SHARE * self.before_nm2
+        return self.gain_nm2 >= 2 * SMALLEST_SHARE * self.before_nm2
 
     def passed(self, *, grouped: bool = False) -> bool:
         """Whether it is confirmed."""

@@ -18,13 +18,12 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop.fits import ALL_FREE, Study
+from litho_models.loop.judging import SMALLEST_SHARE
 from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# Of the squared error: less than this is nothing to look for.
-_SMALLEST_SHARE = 0.01
 # All rows of all scans; with more scans each is thinned.
 _KEPT_BYTES = 512 * 2**20
 # Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
@@ -67,7 +66,7 @@ class Rest:
     def matters(self) -> bool:
         """Whether something is left that can be learned: more than 1 %, and an interval without zero."""
         low, _ = self.ci95_nm2 or (0.0, None)
-        return self.share > _SMALLEST_SHARE and low > 0
+        return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
