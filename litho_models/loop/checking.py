@@ -29,22 +29,6 @@ FORM_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class Checked:
-    """A cause, judged with everything else in place.
-
-    Attributes:
-        reshaped_share: what its change in other shapes would take beside it, of its gain.
-        reason: why its name does not stand; empty if it does.
-        corrects: the reason is that it may only correct the formula of another.
-    """
-
-    cause: Cause
-    reshaped_share: float
-    reason: str
-    corrects: bool = False
-
-
-@dataclass(frozen=True)
 class Check:
     """What the causes of a model are checked by.
 
@@ -61,28 +45,27 @@ class Check:
     secants: Secants
     study: Study
 
-    def of(self, cause: Cause) -> Checked:
-        """One of the causes."""
+    def of(self, cause: Cause) -> Cause:
+        """One of the causes, judged with everything else in place."""
         without = self.state.without(cause.name, self.study)
-        judgement = judge(without.freed_nm2, self.state.freed_nm2, self.study)
-        cause = replace(cause, judgement=judgement)
+        cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
         reshaped_nm2 = reshaped_gain(without, self.state, self.study)
-        share = reshaped_nm2 / max(judgement.gain_nm2, 1e-9)
-        if unneeded := judgement.reason(grouped=cause.by != ALL):
-            return Checked(cause, share, f"not needed beside the others: {unneeded}")
-        if larger := self._larger(cause, without):
-            return Checked(cause, share, f"may only correct the formula of {larger}", corrects=True)
-        exhausted = self.state.twin.exhausts(cause.name)
-        if exhausted and share > FORM_SHARE:
-            text = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
-            return Checked(cause, share, text)
+        share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
+        unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
+        larger = "" if unneeded else self._larger(cause, without)
+        if unneeded:
+            reason = f"not needed beside the others: {unneeded}"
+        elif larger:
+            reason = f"may only correct the formula of {larger}"
+        elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
+            reason = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
         # A small part of what is left is the little that any columns take of causes that are still missing.
-        if share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
+        elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
-            return Checked(cause, share, f"only resembles the cause: {taken}")
-        if laws := self._laws_instead(cause.name, without):
-            return Checked(cause, share, f"short laws do better in its place: {', '.join(laws)}")
-        return Checked(cause, share, "")
+            reason = f"only resembles the cause: {taken}"
+        elif laws := self._laws_instead(cause.name, without):
+            reason = f"short laws do better in its place: {', '.join(laws)}"
+        return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
         """A much larger law, or cause whose change in another shape takes half of what this one does.

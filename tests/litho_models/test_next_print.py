@@ -165,7 +165,7 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
     plain = FieldContext(layout, 0.1, 1.2)
     values = {"length_um": 0.3, "rising": 0.5, "direction": 1.0}
     lag, thinning = get_effect("feedback-lag"), get_effect("slope-thinning")
-    chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values}, full_height_um=1.2, pitch_um=0.1)
+    chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values})
     seen = chain.after_base(height, replace(plain, quarter_turns=1))
     by_hand = torch.rot90(lag(torch.rot90(height, 1, (-2, -1)), values, plain), -1, (-2, -1))
     assert torch.equal(seen, by_hand)
@@ -250,11 +250,11 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
     prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
     twin = rivalry.twins[0]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
-    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).placed().of_labels({})
+    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).of_labels({})
     faded.requires_grad_(False)
     found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
     with torch.no_grad():
-        plain = model({}).placed().of_labels({})
+        plain = model({}).of_labels({})
         heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (rivalry.chains[0], plain)]
     # Gain, registration, tilt and bow take some of what is lost on slopes, not two thirds of it.
     assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
@@ -413,7 +413,7 @@ def second_round(
     """Two prints, each scanned at 0 and 90 degrees, an effect of the printer or of the microscope."""
     random = np.random.default_rng(seed)
     [name] = effects
-    chain = rival(name, effects, owner).twin(model({})).placed().of_labels({})
+    chain = rival(name, effects, owner).twin(model({})).of_labels({})
     scans = []
     for number, blank in enumerate(blank_scans(12, 64)[-2:]):
         rough = gaussian_filter(random.normal(size=blank.shape), 1.0)
@@ -512,7 +512,7 @@ def single_scans(name: str, heights_um: Callable[[PreparedScan, int], np.ndarray
             scan = replace(blank, id=f"N{number}F{at}", print_id=str(number), scan_to_layout=placed)
             [one] = prepare_scans([scan])
             noise = random.normal(0, 0.004, blank.shape)
-            scans += with_heights([scan], [base.placed().height(one) + noise + heights_um(one, number)])
+            scans += with_heights([scan], [base.height(one) + noise + heights_um(one, number)])
     judge_ = Judge(base, study_of(scans), prepare_scans(scans))
     kind = "lines" if "line" in name else "per-scan"
     question = slope_question(name=name, kind=kind, rivals=[])
@@ -645,9 +645,9 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
         for name in ("diffusion-blur", "resampling-blur")
     ]
     random = np.random.default_rng(0)
-    placed, blank = twins[0].placed(), blank_scans(4, 64)
+    twin, blank = twins[0], blank_scans(4, 64)
     heights = [
-        placed.height(scan) + 0.006 * gaussian_filter(random.normal(size=(64, 64)), 1.0) / 0.28
+        twin.height(scan) + 0.006 * gaussian_filter(random.normal(size=(64, 64)), 1.0) / 0.28
         for scan in prepare_scans(blank)
     ]
     windows = [scan.window for scan in prepare_scans(with_heights(blank, heights))]
