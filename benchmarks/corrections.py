@@ -118,20 +118,22 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """What it comes to, and one line for each relief and printer."""
-    rows = record["rows"]
+    """What it comes to, and one line for each relief and kind of printer, over its seeds."""
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in record["rows"]:
+        groups.setdefault((row["relief"], row["judge"]), []).append(row)
     lines = [
-        (
-            row["relief"],
-            f"{row['judge']} {row['seed']}",
-            *(f"{row['printed_nm'][name]:.1f}" for name in COLUMNS),
-            "{:.0f} … {:.0f}".format(*row["between_nm"]),
-        )
-        for row in rows
+        (relief, judge, *(_span([row["printed_nm"][name] for row in rows]) for name in COLUMNS))
+        for (relief, judge), rows in groups.items()
     ]
-    heads = ("relief", "printed by", *COLUMNS.values(), "to be expected")
+    heads = ("relief", "printed by", *COLUMNS.values())
     note = f"rms error of the print, its offset free, nm; reliefs 0.6 µm high on {record['size_px']} px."
-    return f"{summary(rows)}\n\n{markdown_table(heads, lines, note)}"
+    return f"{summary(record['rows'])}\n\n{markdown_table(heads, lines, note)}"
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = (f"{end(values):.0f}" for end in (min, max))
+    return low if low == high else f"{low} to {high}"
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -13,17 +13,6 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def reliefs(record: dict[str, Any]) -> list[str]:
-    def span(relief: str, arm: str) -> str:
-        values = [row[f"{arm}_nm"] for row in record["rows"] if row["relief"] == relief]
-        return f"{min(values):.1f} to {max(values):.1f} nm"
-
-    return [
-        f"| {name} | {span(name, 'affine')} | {span(name, 'corrected')} | {span(name, 'second')} |"
-        for name in ("blaze", "staircase")
-    ] + [f"| {span('lens', 'affine')} | {span('lens', 'corrected')} | {span('lens', 'second')} |"]
-
-
 def photographs(record: dict[str, Any]) -> list[str]:
     errors = np.array([row["error_db"] for row in record["rows"] if "error_db" in row])
     faulty = [row for row in record["rows"] if row["fault"]]
@@ -164,7 +153,6 @@ def quadrants(record: dict[str, Any]) -> list[str]:
 
 
 QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
-    "relief/relief.json": ("optics.md", reliefs),
     "photographs/photographs.json": ("scores.md", photographs),
     "mixed-up/mixed_up.json": ("own_data.md", mixed_up),
     "drift-alarm/drift_alarm.json": ("checking.md", alarms),

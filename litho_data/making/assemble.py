@@ -108,7 +108,7 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
         "Conventions": "CF-1.11",
         "schema": STORE_SCHEMA,
         "name": card.name,
-        "title": card.title,
+        "title": card.title or card.name,
         "license": card.license,
         "citation": card.citation,
         **facts,

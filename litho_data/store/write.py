@@ -29,11 +29,6 @@ PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_u
 # What an image of a scan shows.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
-# Attributes of the CF conventions beyond unit and name.
-_CF: dict[str, dict[str, Any]] = {
-    "height_um": {"ancillary_variables": "valid"},
-    "valid": {"flag_values": [0, 1], "flag_meanings": "not_measured measured"},
-}
 
 
 def write_scan_group(
@@ -87,8 +82,7 @@ def write_samples(
     for variable in LAYOUT_VARIABLES if with_sigma else SAMPLE_VARIABLES:
         sample = tuple(field_shape[dim] for dim in variable.sample_dims)
         arrays[variable.name] = _create(root, variable.name, (len(scans), *sample), chunks=(1, *sample))
-    if with_sigma:
-        arrays["height_um"].attrs["ancillary_variables"] = f"valid {SIGMA.name}"
+    arrays["height_um"].attrs["ancillary_variables"] = f"valid {SIGMA.name}" if with_sigma else "valid"
     for row, scan in enumerate(scans):
         loaded = load(scan["id"])
         for name, array in arrays.items():
@@ -107,10 +101,11 @@ def write_samples(
         if any(name in scan["columns"] for scan in scans):
             write_strings(root, name, [str(scan["columns"].get(name, "")) for scan in scans], "scan")
     for axis, count in (("y", ny), ("x", nx)):
-        described = {"long_name": f"{axis} of the pixel centres, layout frame", "axis": axis.upper()}
+        described = {"long_name": f"{axis} of the pixel centres, layout frame", "units": "um"}
         centres = pixel_centres_um(count, pitch_um)
-        for name in (f"{axis}_um", axis):
-            write_numbers(root, name, centres, axis, attributes={"units": "um", **described})
+        write_numbers(root, f"{axis}_um", centres, axis, attributes=described)
+        # By the CF conventions one coordinate of an array names the axis.
+        write_numbers(root, axis, centres, axis, attributes={**described, "axis": axis.upper()})
 
 
 def pixel_centres_um(count: int, pitch_um: float) -> Array:
@@ -173,7 +168,7 @@ def consolidate(root: zarr.Group) -> None:
 def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.Array:
     variable = VARIABLES[name]
     unit = {"comment": MIXED_UNITS[name]} if name in MIXED_UNITS else {"units": variable.unit}
-    attributes = {**unit, "long_name": variable.long_name, **_CF.get(name, {})}
+    attributes = {**unit, "long_name": variable.long_name}
     if variable.dims[:2] == ("scan", "y"):
         attributes["coordinates"] = "print order y_um x_um"
     # A scan's own frame has other sizes than the layouts: in one tree its axes need other names.

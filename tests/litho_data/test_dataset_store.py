@@ -70,7 +70,7 @@ def test_opens_with_xarray_without_a_warning(campaign: Path, recwarn: pytest.War
     assert dataset["height_um"].attrs["units"] == "um"
     assert dataset["y_um"].values[:2] == pytest.approx([0.05, 0.15])
     assert [str(value) for value in dataset["print"].values] == ["1", "1", "2"]
-    assert [dataset[name].attrs["axis"] for name in ("y_um", "x_um")] == ["Y", "X"]
+    assert [dataset[name].attrs["axis"] for name in "yx"] == ["Y", "X"]
     assert dataset["height_um"].attrs["ancillary_variables"] == "valid height_sigma_um"
     assert "units" not in dataset["scan_to_layout"].attrs
     quality = xarray.open_zarr(campaign / "prints.zarr", group="quality")
@@ -203,21 +203,3 @@ def test_a_copy_with_its_groups_has_to_be_whole(campaign: Path, tmp_path: Path) 
         open_store(tmp_path / "lacks.zarr")
     tree.to_zarr(tmp_path / "whole.zarr", write_empty_chunks=True)
     assert open_store(tmp_path / "whole.zarr").sha256 == open_store(campaign / "prints.zarr").sha256
-
-
-def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
-    """What its tools follow: names in ``labels``, then axes, pixel size and path of an image."""
-    root = open_store(campaign / "prints.zarr").root
-    groups = [root[letter] for letter in root.attrs["labels"]]
-    names = [name for group in groups for name in group.attrs["labels"]]
-    assert names == ["../scans/P11", "../scans/P12", "../scans/P21"]
-    ome = root["scans/P12"].attrs["ome"]
-    (image,) = ome["multiscales"]
-    (dataset,) = image["datasets"]
-    assert ome["version"] == "0.5"
-    # OME-NGFF 0.5: axes and dimensions of the array must have the same names.
-    dimensions = root["scans/P12"][dataset["path"]].metadata.dimension_names
-    assert tuple(axis["name"] for axis in image["axes"]) == dimensions
-    assert {(axis["type"], axis["unit"]) for axis in image["axes"]} == {("space", "micrometer")}
-    assert dataset["coordinateTransformations"] == [{"type": "scale", "scale": [0.1, 0.1]}]
-    assert root["scans/P12"][dataset["path"]].shape == (128, 128)

@@ -1,4 +1,4 @@
-"""Releases in the tools of others: mlcroissant and rocrate."""
+"""Stores and releases in the tools of others: mlcroissant, rocrate, ome-zarr-models, compliance-checker."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ from pathlib import Path
 
 import mlcroissant
 import pytest
+import xarray
+import zarr
+from compliance_checker.runner import CheckSuite
+from ome_zarr_models.v05 import Image
 from rocrate.rocrate import ROCrate
 
 from litho_data.exchange.release import export_ro_crate
 from litho_data.foundation.hashes import file_sha256
 from litho_data.store import open_store
+from litho_data.store.write import consolidate
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +49,44 @@ def test_the_crate_reads_as_one(release: Path) -> None:
     build = crate.get("#build")
     assert build["startTime"] < build["endTime"]
     assert build["instrument"]["name"] == "litholoop"
+
+
+def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
+    """Its tools follow ``labels``; the model of the format checks axes, scales and arrays."""
+    root = open_store(campaign / "prints.zarr").root
+    groups = [root[letter] for letter in root.attrs["labels"]]
+    names = [name for group in groups for name in group.attrs["labels"]]
+    assert names == ["../scans/P11", "../scans/P12", "../scans/P21"]
+    for name in names:
+        image = Image.from_zarr(root[f"scans/{Path(name).name}"])
+        (shown,) = image.attributes.ome.multiscales
+        assert {(axis.type, axis.unit) for axis in shown.axes} == {("space", "micrometer")}
+        assert shown.datasets[0].coordinateTransformations[0].scale == pytest.approx([0.1, 0.1])
+
+
+def cf_complaints(store: Path, netcdf: Path) -> set[str]:
+    """What compliance-checker finds in a NetCDF copy: words as characters, coordinates never missing."""
+    prints = xarray.open_zarr(store)
+    words = [name for name in prints.coords if prints[name].dtype.kind not in "biuf"]
+    encoding = {str(name): {"_FillValue": None} for name in prints.coords if name not in words}
+    prints.to_netcdf(netcdf, encoding=encoding | {str(name): {"dtype": "S1"} for name in words})
+    CheckSuite.load_all_available_checkers()
+    suite = CheckSuite()
+    results, errors = suite.run_all(suite.load_dataset(str(netcdf)), ["cf:1.11"])["cf:1.11"]
+    assert not errors
+    failed = [one for one in results if one.value[0] < one.value[1]]
+    return {f"{one.name}: {message}" for one in failed for message in one.msgs}
+
+
+def test_units_and_coordinates_follow_the_cf_conventions(campaign: Path, tmp_path: Path) -> None:
+    """But for latitudes and longitudes: the checker takes every axis Y for one, whatever its unit."""
+    found = cf_complaints(campaign / "prints.zarr", tmp_path / "prints.nc")
+    assert not {one for one in found if not one.startswith(("§4.1 Latitude", "§4.2 Longitude"))}
+
+
+def test_a_wrong_unit_is_a_complaint(own_campaign: Path, tmp_path: Path) -> None:
+    store = own_campaign / "prints.zarr"
+    root = zarr.open_group(store)
+    root["height_um"].attrs["units"] = "heights"
+    consolidate(root)
+    assert any("heights" in one for one in cf_complaints(store, tmp_path / "prints.nc"))

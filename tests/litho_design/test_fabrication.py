@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +15,7 @@ from litho_design.optimisation.fabrication import Fabrication, fabrication_penal
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.training import out_of_distribution
 from litho_design.reports.advice import distribution_warning
+from litho_design.tasks.design import LEVELS_FILE
 
 LAYOUT = LayoutSettings(size_px=16, levels=13)
 
@@ -110,3 +114,13 @@ def test_a_flagged_design_says_so_and_a_search_that_stays_inside_is_closer(tmp_p
     assert kept.out_of_distribution.level_distance < gauge.level_distance
     with pytest.raises(InputError, match="other settings"):
         designed("free", **{"fabrication.min_feature_um": 0.8})
+
+
+@pytest.mark.parametrize(
+    ("source", "files", "told"),
+    [("folder", [LEVELS_FILE], True), ("folder", [], False), ("none", [LEVELS_FILE], False)],
+)
+def test_an_unknown_distance_is_told_of_levels_that_a_model_prints(source, files, told):
+    printer = SimpleNamespace(source=source, name="own")
+    design: Any = SimpleNamespace(out_of_distribution=None, printer=printer, files=files)
+    assert ("model own does not describe" in distribution_warning(design)) is told

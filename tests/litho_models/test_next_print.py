@@ -227,6 +227,16 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
         assert spectrum.along(change) == pytest.approx(np.std(draws) / np.linalg.norm(change), rel=0.2)
 
 
+@pytest.mark.parametrize("scans", [1, 2])
+def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rivalry, limits: Limits) -> None:
+    """Scans of one print share it, so that along their sum it is larger than along each."""
+    prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
+    plain = model({}).placed().of_labels({}).requires_grad_(False)
+    found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
+    # Single precision.
+    assert found.noise_nm == pytest.approx(NOISE_NM * math.sqrt(scans), rel=1e-4)
+
+
 def test_only_a_turned_scan_separates_printer_from_microscope(rivalry: Rivalry, limits: Limits) -> None:
     level = first_layout(limits)
     # Unturned the two are the same model: what is left is the refit's rounding.

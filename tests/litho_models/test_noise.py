@@ -18,7 +18,7 @@ from litho_data.store.lock_box import locked_ids
 from litho_models.cli.noise import noise
 from litho_models.noise.analyse import analyse_noise_of_files
 from litho_models.noise.budget import noise_budget
-from litho_models.noise.calibration import analyse_spread, conformal_factor
+from litho_models.noise.calibration import Stated, _bins, analyse_spread, calibrate, conformal_factor
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import repeated_prints
 from litho_models.noise.residuals import Residuals, disagreement_um
@@ -512,6 +512,17 @@ def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not(freedo
         assert row.coverage_68 == pytest.approx(0.68, abs=0.03)
         assert row.coverage_95 == pytest.approx(0.95, abs=0.015)
         assert row.predicted_nm == pytest.approx(row.rms_nm, rel=0.08)
+
+
+def test_errors_half_as_large_again_as_stated_are_so_for_all_groups_and_scans(random):
+    scans, _, sigmas = planted_residuals(count=3)
+    errors = [1.5 * sigma * random.choice([-1, 1], sigma.shape) for sigma in sigmas]
+    stated = [Stated(sigma, GAUSSIAN) for sigma in sigmas]
+    groups = _bins(scans, [place_maps(scan) for scan in scans], errors, stated)
+    for row in [*groups, *calibrate("exact", scans, errors, stated).scans]:
+        # The order of the errors is that of σ.
+        assert (row.ence, row.ause) == pytest.approx((0.5, 0), abs=1e-9)
+    assert [row.rms_nm for row in groups] == pytest.approx([1.5 * row.predicted_nm for row in groups])
 
 
 def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():

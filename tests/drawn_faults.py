@@ -1,0 +1,118 @@
+"""Small faults at places that a seed draws over the whole product, to see how many the tests notice.
+
+``python -m tests.drawn_faults SEED COUNT`` prints them; with a FILE of lines ``NUMBER TESTS`` it puts each in
+and runs those tests. Each line of code is as likely as another, and so is each change that can be made in it.
+What is stated once as a constant or a default is a choice, and no fault if it is another.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import random
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.faults import ROOT, Fault, try_all
+
+PRODUCT = ("litho_data", "litho_models", "litho_design")
+OTHER: dict[type, type] = {
+    **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Div},
+    **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq},
+    **{ast.NotEq: ast.Eq, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is},
+    **{ast.And: ast.Or, ast.Or: ast.And},
+}
+PAIRS = (
+    "x y,nx ny,min max,cos sin,lower upper,low high,rows columns,any all,sum mean,argmin argmax,before after"
+)
+PAIRS += (
+    ",floor ceil,minimum maximum,fft2 ifft2,first second,first last,width_um height_um,union intersection"
+)
+NAMES = {one: other for pair in PAIRS.split(",") for one, other in (pair.split(), pair.split()[::-1])}
+
+
+def changes(node: ast.AST) -> Iterator[ast.AST]:
+    """What could stand in place of an expression by a slip."""
+    new = copy.deepcopy(node)
+    match new:
+        case ast.BinOp() | ast.BoolOp() if type(new.op) in OTHER:
+            new.op = OTHER[type(new.op)]()
+            yield new
+        case ast.Compare(ops=[op]) if type(op) in OTHER:
+            new.ops = [OTHER[type(op)]()]
+            yield new
+        case ast.UnaryOp(op=ast.Not() | ast.USub()):
+            yield new.operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield from (
+                ast.Constant(other) for other in ({value + 1, 1 - value} if value < 2 else {value + 1})
+            )
+        case ast.Constant(value=float(value)):
+            yield ast.Constant(2 * value)
+        case ast.Name(id=name) if name in NAMES:
+            yield ast.Name(NAMES[name])
+        case ast.Attribute(attr=name) if name in NAMES:
+            new.attr = NAMES[name]
+            yield new
+        case ast.Tuple(elts=[first, second, *_], ctx=ast.Load()) | ast.List(elts=[first, second, *_]):
+            new.elts[:2] = [second, first]
+            yield new
+        case ast.Call(args=[first, second, *_]):
+            new.args[:2] = [second, first]
+            yield new
+        case ast.IfExp():
+            new.body, new.orelse = new.orelse, new.body
+            yield new
+
+
+def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
+    """All of the bodies of functions, but what only types and messages hold."""
+    for child in ast.iter_child_nodes(tree):
+        if isinstance(child, ast.arguments | ast.JoinedStr | ast.Raise) or child is getattr(
+            tree, "annotation", 0
+        ):
+            continue
+        if within and child is not getattr(tree, "returns", 0):
+            yield child
+        yield from expressions(child, within=within or isinstance(tree, ast.FunctionDef))
+
+
+def drawn(seed: int, count: int) -> list[Fault]:
+    """So many faults, each with the whole of its file, and with no tests yet."""
+    places: dict[tuple[Path, int], list[tuple[ast.expr, ast.AST]]] = {}
+    for file in sorted(file for package in PRODUCT for file in (ROOT / package).rglob("*.py")):
+        for node in expressions(ast.parse(file.read_bytes())):
+            if isinstance(node, ast.expr):
+                for new in changes(node):
+                    if ast.dump(new) != ast.dump(node):
+                        places.setdefault((file, node.lineno), []).append((node, new))
+    chance = random.Random(seed)
+    faults = []
+    for number, (file, line) in enumerate(chance.sample(sorted(places), count), 1):
+        node, new = chance.choice(places[file, line])
+        source = file.read_bytes()
+        starts = [0, *(at + 1 for at, byte in enumerate(source) if byte == ord("\n"))]
+        assert node.end_lineno
+        assert node.end_col_offset
+        begin, end = starts[line - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+        wrong = source[:begin] + f"({ast.unparse(new)})".encode() + source[end:]
+        name = f"{number} {file.relative_to(ROOT)}:{line}  {ast.unparse(node)}  ->  {ast.unparse(new)}"
+        faults.append(Fault(name, str(file.relative_to(ROOT)), source.decode(), wrong.decode(), ""))
+    return faults
+
+
+def main(seed: str, count: str, file: str = "") -> int:
+    """Print the faults, or try those that a file names tests for; returns how many were not noticed."""
+    faults = drawn(int(seed), int(count))
+    if not file:
+        print(*(one.name for one in faults), sep="\n")
+        return 0
+    lines = [line.split(maxsplit=1) for line in Path(file).read_text(encoding="utf-8").splitlines()]
+    return try_all([faults[int(number) - 1]._replace(tests=tests) for number, tests in lines])
+
+
+if __name__ == "__main__":
+    raise SystemExit(1 if main(*sys.argv[1:]) else 0)
