@@ -29,7 +29,7 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
-from litho_models.effects.chain import EffectChain
+from litho_models.effects.chain import EffectChain, Frame
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
@@ -77,7 +77,7 @@ QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 def model(effects: dict[str, dict[str, float]]) -> Twin:
     """The base of ``loop_scans`` with effects."""
-    twin = Twin.of_base(base_model(), 1.2, 0.1)
+    twin = Twin.bare(base_model())
     for name, values in effects.items():
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values(values)})
     return twin
@@ -172,19 +172,12 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
     back = chain.after_base(height, replace(plain, backward=True))
     assert torch.allclose(back, lag(height, {**values, "direction": -1.0}, plain))
     amounts = thinning.with_values({"along_x_um": 0.2})
-    for frame, axis in (((), "along_x_um"), (("slope-thinning",), "along_y_um")):
-        chain = EffectChain(
-            torch.nn.Identity(),
-            {"slope-thinning": amounts},
-            full_height_um=1.2,
-            pitch_um=0.1,
-            scan_frame=frame,
-        )
+    frames: tuple[dict[str, Frame], ...] = ({}, {"slope-thinning": "scan"})
+    for own, axis in zip(frames, ("along_x_um", "along_y_um"), strict=True):
+        chain = EffectChain(torch.nn.Identity(), {"slope-thinning": amounts}, own)
         expected = thinning(height, thinning.with_values({axis: 0.2}), plain)
         assert torch.allclose(chain.after_base(height, replace(plain, quarter_turns=1)), expected, atol=1e-6)
-    tip = EffectChain(
-        torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}}, full_height_um=1.2, pitch_um=0.1
-    )
+    tip = EffectChain(torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}})
     assert torch.equal(tip.after_base(height, replace(plain, new_tip=True)), height)
     assert not torch.equal(tip.after_base(height, plain), height)
 
@@ -651,7 +644,7 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
         "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
     )
     twins = [
-        Twin.of_base(base, 1.2, 0.1).with_effect(name, ALL, {"": {"variance_um2": 0.1}})
+        Twin.bare(base).with_effect(name, ALL, {"": {"variance_um2": 0.1}})
         for name in ("diffusion-blur", "resampling-blur")
     ]
     random = np.random.default_rng(0)
