@@ -224,7 +224,7 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
 def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rivalry, limits: Limits) -> None:
     """Scans of one print share it, so that along their sum it is larger than along each."""
     prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
-    plain = model({}).placed().of_labels({}).requires_grad_(False)
+    plain = model({}).chain().requires_grad_(False)
     found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
     # Single precision.
     assert found.noise_nm == pytest.approx(NOISE_NM * math.sqrt(scans), rel=1e-4)
@@ -257,7 +257,7 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
     faded.requires_grad_(False)
     found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
     with torch.no_grad():
-        plain = model({}).of_labels({})
+        plain = model({}).chain()
         heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (rivalry.chains[0], plain)]
     # Gain, registration, tilt and bow take some of what is lost on slopes, not two thirds of it.
     assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
