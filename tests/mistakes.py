@@ -117,6 +117,23 @@ MISTAKES: dict[str, dict[str, str]] = {
         "a GPU that is not there": "litho-design hoe --model printer --device cuda:7 --out new",
         "a negative base": "litho-design export design --format stl --pedestal-um -1 --out new",
     },
+    "Numbers that cannot be": {
+        "a base higher than the sky": "litho-design export design --format stl --pedestal-um 1e300 --out new",
+        "a pixel that is no number": "litho-design export layout.npy --pitch-um nan --out new",
+        "a level of no height": "litho-design export layout.npy --level-height-um 0 --out new",
+        "a scan without end": "litho-design export design --format gwl --gwl-speed 1e300 --out new",
+        "write fields anywhere": "litho-design score design --judge printer --stitch-sigma-um inf --out new",
+        "levels without end": "litho-design hoe --model none --level-height-um 1e300 --out new",
+        "gains of any size": "litho-design hoe --model none --gain-sd 1e15 --out new",
+        "steps without end": "litho-design hoe --model none --learning-rate 1e300 --out new",
+        "an effect beyond what it can be": "litho-models close-loop prints.zarr "
+        "--inject diffusion-blur=1e300 --out new",
+        "an alarm more often than not": "litho-models check printer prints.zarr --reference other.zarr "
+        "--false-alarms nan --out new",
+        "heights in a picture of numbers": "litho-data inspect raw/scans/P11.txt --full-scale-um inf",
+        "a microscope without scale": "litho-design score design --scan raw/scans/P11.txt --scan-unit m "
+        "--scan-size-um 1e300 --out new",
+    },
     "Python": {
         "levels in place of heights": 'litho_models.load_frozen("printer").predict(np.zeros((9, 9), int))',
         "a list in place of an array": 'litho_models.load_frozen("printer").predict([[0.1]])',

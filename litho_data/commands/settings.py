@@ -4,7 +4,6 @@ The command lines make their options from these fields, and every field can be c
 """
 
 import json
-import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,8 +14,11 @@ from pydantic import BaseModel, Field, ValidationError
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import parsed
+from litho_data.foundation.quantities import LENGTH_UM
 
 M = TypeVar("M", bound=BaseModel)
+# Squares of larger ones are no numbers of single precision.
+_LARGEST = 1e15
 
 
 def setting(
@@ -30,8 +32,10 @@ def setting(
         unit: of the value, such as µm.
         option: name or names on the command line, such as ``--pitch-um``; none for settings that are
             reached by their dotted path only.
-        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``).
+        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); no length is beyond all lengths.
     """
+    if unit == "µm":
+        limits = {"le": LENGTH_UM.high} | limits
     options: Any = [option] if isinstance(option, str) else list(option)
     return Field(
         default=default, description=help, json_schema_extra={"unit": unit, "options": options}, **limits
@@ -131,8 +135,9 @@ def changed(settings: M, changes: Mapping[str, Any]) -> M:
     """
     content = settings.model_dump()
     for path, value in flattened(settings, changes).items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise InputError(f"setting {path}", got=value, wanted="a finite number")
+        numbers = value if isinstance(value, list | tuple) else [value]
+        if any(isinstance(one, int | float) and not abs(one) <= _LARGEST for one in numbers):
+            raise InputError(f"setting {path}", got=value, wanted=f"a finite number up to {_LARGEST:g}")
         *parts, last = path.split(".")
         place = content
         for part in parts:

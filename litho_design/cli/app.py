@@ -105,15 +105,11 @@ def score(
     ] = None,
     stitch_field_um: Annotated[
         float,
-        typer.Option(
-            help="side of the write fields that the judges' prints are made of, µm", min=1e-6, hidden=True
-        ),
+        typer.Option(help="side of the write fields that the judges' prints are made of, µm", hidden=True),
     ] = 100.0,
     stitch_sigma_um: Annotated[
         float,
-        typer.Option(
-            help="sd along each axis by which each of them lies off its place, µm", min=0, hidden=True
-        ),
+        typer.Option(help="sd along each axis by which each of them lies off its place, µm", hidden=True),
     ] = 0.0,
     stream: Annotated[
         bool,
@@ -131,7 +127,7 @@ def score(
     from litho_design.optimisation.stitching import Stitching
     from litho_design.workflows.score import score as score_design
 
-    stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
+    stitch = changed(Stitching(), {"field_um": stitch_field_um, "sigma_um": stitch_sigma_um})
     if camera is not None and camera_pitch_um is None:
         raise InputError(
             "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
@@ -159,7 +155,7 @@ def score(
         scan=measured,
         camera=photo,
         element=element,
-        stitch=stitch,
+        stitch=stitch if stitch_sigma_um else None,
         band_px=band_px if stream else None,
         device=device,
         extrapolate=extrapolate,

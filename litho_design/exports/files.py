@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +12,7 @@ import numpy as np
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, file_sha256
+from litho_data.foundation.quantities import LEVEL_HEIGHT_UM, PITCH_UM
 from litho_data.readers.exported import exported_levels, exported_rows
 from litho_design.elements.element import Element
 from litho_design.exports.dxf import write_dxf
@@ -100,8 +100,11 @@ def export(
     for setting, value in job.items():
         # Only a closed solid needs a base.
         may_be_zero = setting == "pedestal_um" and format not in ("stl", "gwl")
-        if not 0 <= value < math.inf or (value == 0 and not may_be_zero):
-            raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
+        if not 0 <= value <= LEVEL_HEIGHT_UM.high or (value == 0 and not may_be_zero):
+            wanted = f"a positive length of {LEVEL_HEIGHT_UM.high:g} µm at most"
+            raise InputError(setting, got=f"{value:g} µm", wanted=wanted)
+    PITCH_UM.require("pitch_um", pitch_um)
+    LEVEL_HEIGHT_UM.require("level_height_um", level_height_um)
     source = _source(design, pitch_um, level_height_um)
     levels = written = source.levels
     if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:

@@ -22,7 +22,7 @@ class Gwl(Record):
 
     mode: Literal["galvo", "piezo"] = setting("galvo", "Who moves the focus: galvo or piezo")
     field_um: float = setting(100.0, "Side of a write field of the galvo", unit="µm", gt=0)
-    speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", gt=0)
+    speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", gt=0, le=1e7)
     power_percent: tuple[float, ...] = setting(
         (50.0,),
         "Laser power, %: one number, or that of the pedestal and of every level above it",

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Literal
 
 from litho_data.commands.settings import setting
-from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record
 from litho_design.optics.materials import Resin, refractive_index
 
@@ -42,7 +41,6 @@ class Optics(Record):
         unit="µm",
         option=("--distance-um", "--focal-length-um"),
         gt=0,
-        le=LENGTH_UM.high,
     )
 
     incidence_x: float = setting(0.0, "Sine of the angle at which light falls in, along x", gt=-1, lt=1)
@@ -58,21 +56,18 @@ class Optics(Record):
         "Standard deviation of the wavelengths of the source; 0 for one colour",
         unit="µm",
         ge=0,
-        le=LENGTH_UM.high,
     )
     beam_um: float = setting(
         0.0,
         "Radius of a Gaussian beam on the element, at 1/e² of its intensity; 0 for even light",
         unit="µm",
         ge=0,
-        le=LENGTH_UM.high,
     )
     source_distance_um: float = setting(
         0.0,
         "Distance of the point before the element that its light comes from; 0 for far away",
         unit="µm",
         ge=0,
-        le=LENGTH_UM.high,
     )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum", "far-field"] = setting(
         "auto",

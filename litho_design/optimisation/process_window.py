@@ -40,7 +40,7 @@ class ProcessWindow(Record):
     microscope.
     """
 
-    gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0)
+    gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0, le=1)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
     gain_offset_correlation: float = setting(0.0, "Correlation of gain and offset", ge=-1, le=1)
     blur_sd_um: float = setting(

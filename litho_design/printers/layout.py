@@ -8,6 +8,7 @@ import numpy as np
 
 from litho_data.commands.settings import setting
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import LEVEL_HEIGHT_UM, PITCH_UM
 from litho_data.foundation.results import Record
 
 _LARGE_JUMP_LEVELS = 8
@@ -21,7 +22,12 @@ class LayoutSettings(Record):
 
     size_px: int = setting(1024, "Side of the element", unit="px", option="--size-px", ge=4)
     pitch_um: float = setting(
-        0.1, "Side of a pixel, which must be that of the model", unit="µm", option="--pitch-um", gt=0
+        0.1,
+        "Side of a pixel, which must be that of the model",
+        unit="µm",
+        option="--pitch-um",
+        ge=PITCH_UM.low,
+        le=PITCH_UM.high,
     )
     cell_um: float = setting(
         0.4, "Side of a free cell (hologram) or width of a ring (lens)", unit="µm", option="--cell-um", gt=0
@@ -35,7 +41,14 @@ class LayoutSettings(Record):
         ge=0,
     )
     levels: int = setting(13, "Number of printable levels", option="--levels", ge=2, le=256)
-    level_height_um: float = setting(0.1, "Height of one level", unit="µm", option="--level-height-um", gt=0)
+    level_height_um: float = setting(
+        0.1,
+        "Height of one level",
+        unit="µm",
+        option="--level-height-um",
+        ge=LEVEL_HEIGHT_UM.low,
+        le=LEVEL_HEIGHT_UM.high,
+    )
     symmetry: Literal["none", "radial"] = setting("none", "Whether the free cells are rings around the axis")
 
     @property

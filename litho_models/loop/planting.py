@@ -32,6 +32,7 @@ def parse_planted(text: str) -> tuple[Effect, float]:
         raise InputError("--inject", got=repr(text), wanted="NAME=AMOUNT, such as vignetting=0.1")
     if effect.per_scan:
         raise InputError("--inject", got=name, wanted="an effect with one value for all scans")
+    effect.require_in_range({effect.amplitudes[0]: amount})
     return effect, amount
 
 

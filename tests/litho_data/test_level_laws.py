@@ -238,6 +238,19 @@ def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
 
 
+def test_a_disc_of_three_points_is_the_mean_of_its_selected_pixels() -> None:
+    z = ramp((20, 30), 0.3, 0.002, -0.003)
+    points = {"points_px": [(4, 4), (4, 25), (15, 8)], "radius_px": 2.0, "set_zero": True}
+    # Pixels of each disc that lie opposite each other, so that a plane keeps its mean.
+    left_out = np.zeros(z.shape, bool)
+    left_out[[3, 5, 3, 5, 14, 16], [4, 4, 25, 25, 8, 8]] = True
+    spoiled = np.where(left_out, 50.0, z)
+    for masking, mask in (("exclude", left_out), ("include", ~left_out)):
+        levelled = level_three_point(spoiled, mask=mask, masking=masking, **points)
+        assert np.abs(levelled.height[~left_out]).max() < ROUNDING
+    assert np.abs(level_three_point(spoiled, **points).height).min() > 0
+
+
 def test_matching_asks_an_inclusion_mask_in_all_columns_but_the_last() -> None:
     z = rough((20, 30), 7)
     chosen = np.random.default_rng(8).random(z.shape) < 0.8

@@ -77,7 +77,10 @@ def test_dirt_is_film_where_none_can_be_and_a_lost_island_is_print() -> None:
     seen[10:24, 10:24] = 0
     seen[50:56, 15:21] = 1
     dirt = foreign(seen, layout, 5)
-    assert dirt[50:56, 15:21].all()
+    # Farther than 5 px from all edges, and as far around it.
+    assert dirt[52, 16:20].all()
+    assert dirt[45:61, 17].all()
+    assert not dirt[44, 17]
     assert not dirt[:44].any()
 
 

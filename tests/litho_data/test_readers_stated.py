@@ -178,6 +178,18 @@ def test_axes_in_the_last_row_and_column_are_no_heights(tmp_path: Path) -> None:
     refused(path, "axes in the last row and column")
 
 
+@pytest.mark.parametrize("level", [True, False])
+def test_a_first_row_and_column_with_a_level_part_are_no_axes(level: bool, tmp_path: Path) -> None:
+    table = np.random.default_rng(0).permutation(72).reshape(8, 9).astype(float)
+    falling = np.array([99.0, 80, 71, 71 if level else 70, 60, 50, 30, 10])
+    table[0, 1:], table[1:, 0] = falling, falling[:7]
+    np.savetxt(tmp_path / "scan.txt", table, fmt="%g")
+    if level:
+        np.testing.assert_array_equal(read_scan(tmp_path / "scan.txt", unit="um").height_um, table)
+    else:
+        refused(tmp_path / "scan.txt", "first row and column that rise like axes")
+
+
 def test_json_beside_a_page_is_read_like_words(tmp_path: Path) -> None:
     path = tmp_path / "scan.tif"
     tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), metadata={"unit": "nm"})

@@ -73,6 +73,9 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         assert [member.name for member in design.ensemble.members] == ["wide"]
         assert Design.read(tmp_path / f"{weight:g}") == design
         apart[weight] = design.ensemble.disagreement_waves
+        told = "Designed with wide as well: on this layout the models disagree by "
+        told += f"{design.ensemble.disagreement_nm:.1f} nm"
+        assert told in (tmp_path / f"{weight:g}" / "report.html").read_text(encoding="utf-8")
     assert apart[20.0] < 0.8 * apart[0.0]
     # The worst of the members, and their disagreement in waves.
     main, other = models()

@@ -14,7 +14,7 @@ from litho_design import design_hologram, hologram_settings
 from litho_design.optimisation.fabrication import Fabrication, fabrication_penalty, outside
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.training import out_of_distribution
-from litho_design.reports.advice import distribution_warning
+from litho_design.reports.advice import distribution_warning, stroke_advice
 from litho_design.tasks.design import LEVELS_FILE
 
 LAYOUT = LayoutSettings(size_px=16, levels=13)
@@ -124,3 +124,15 @@ def test_an_unknown_distance_is_told_of_levels_that_a_model_prints(source, files
     printer = SimpleNamespace(source=source, name="own")
     design: Any = SimpleNamespace(out_of_distribution=None, printer=printer, files=files)
     assert ("model own does not describe" in distribution_warning(design)) is told
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_a_full_wave_needs_is_told_where_something_reaches_it(known):
+    stroke = SimpleNamespace(stroke_waves=0.6, print_gain=0.7, blaze_order_1=0.5, blaze_order_0=0.25)
+    stroke.levels_for_one_wave, stroke.level_height_for_one_wave_um = (21, 0.166) if known else (None, None)
+    layout = SimpleNamespace(level_height_um=0.1, levels=13)
+    design: Any = SimpleNamespace(stroke=stroke, out_of_distribution=None, layout=layout)
+    said = stroke_advice(design)
+    assert "0.60 waves above the lowest (gain 0.70)" in said
+    assert "50.0 % into the first order and 25.0 % straight through" in said
+    assert ("A full wave needs 21 levels of 0.1 µm, or 13 levels of 0.166 µm." in said) is known

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import subprocess
 import sys
 import tomllib
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 
 from litho_data.commands.settings import Leaf, changed, leaves
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import LENGTH_UM
 from litho_design.cli.app import app
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
@@ -107,6 +109,24 @@ def test_every_setting_says_what_it_is_and_in_which_unit(task):
         assert not leaf.help.endswith("."), leaf.path
         suffix = leaf.path.rpartition("_")[2]
         assert {"um": "µm", "px": "px"}.get(suffix, leaf.unit) == leaf.unit, leaf.path
+
+
+@of_each_task
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -1e300, 1e300, 10**400])
+def test_no_setting_takes_a_number_that_cannot_be(task, wrong):
+    for leaf in leaves(PRESETS[task]):
+        with pytest.raises(InputError) as said:
+            changed(PRESETS[task], {leaf.path: wrong})
+        assert str(said.value).startswith(f"setting {leaf.path}")
+        assert "\n" not in str(said.value)
+
+
+@of_each_task
+def test_no_length_is_beyond_all_lengths(task):
+    for leaf in leaves(PRESETS[task]):
+        if leaf.unit == "µm":
+            with pytest.raises(InputError, match="wanted less than"):
+                changed(PRESETS[task], {leaf.path: 1.01 * LENGTH_UM.high})
 
 
 @of_each_task

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_design.images.targets import draw_target, load_target
+from litho_design.images.targets import draw_target, load_target, read_grey
 
 
 @pytest.mark.parametrize("name", ["text", "ring", "chart", "spots"])
@@ -39,6 +39,20 @@ def test_another_size_and_shape_are_adapted_and_said(tmp_path):
     assert (image * rows).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
     assert (image * columns).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
     assert image.max() == 1
+
+
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
+def test_a_colour_is_its_luma_and_what_is_transparent_is_black(tmp_path, depth):
+    white = np.iinfo(depth).max
+    colour = np.zeros((4, 2, 4), depth)
+    colour[:, :, :3], colour[:2, :, 3], colour[2:, :, 3] = [white // 4, white // 2, white], white, white // 2
+    # ITU-R BT.601 of blue, green and red.
+    luma = 0.114 * 0.25 + 0.587 * 0.5 + 0.299
+    for channels, shares in ((4, [1, 0.5]), (3, [1, 1])):
+        cv2.imwrite(str(tmp_path / "colour.png"), colour[..., :channels])
+        grey, notes = read_grey(tmp_path / "colour.png", "target")
+        assert grey[[0, 3], 0] / white == pytest.approx(luma * np.array(shares), abs=2 / 255)
+        assert ("alpha channel composed on black" in notes) is (channels == 4)
 
 
 def test_what_is_no_image_or_has_no_light_is_refused(tmp_path):

@@ -68,6 +68,8 @@ def test_a_board_of_other_settings_is_refused(board):
         (Answer(found=[Found(names=["vignetting"], knowledge="cause")]), ["right", "false-positive"], [0, 1]),
         (Answer(left=True), ["noticed", "false-positive"], [0, 0]),
         (Answer(), ["missed", "clean"], [0, 0]),
+        # One error alone is compared with nothing.
+        (Answer(after_nm=20), ["missed", "clean"], [0, 0]),
     ],
 )
 def test_the_judge_compares_names_with_what_is_hidden(board, tmp_path, answer, wanted, false):

@@ -17,7 +17,7 @@ from litho_models.loop import learner as module
 from litho_models.loop.fits import Study
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import base_model, planted, study_of
 
@@ -156,3 +156,15 @@ def test_the_form_may_be_wrong_by_the_upper_end_of_what_could_be_learned() -> No
     assert Rest(-gains, np.full(6, 100.0)).most_nm == 0.0
     # Too few scans for an interval: the mean.
     assert Rest(gains[:2], np.full(2, 100.0)).most_nm == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("size", [40, 41])
+def test_splines_of_an_axis_are_the_same_from_both_ends_and_constant_beyond_what_is_sampled(
+    size: int,
+) -> None:
+    splines, border = module._splines(size), sample_border_px(size)
+    np.testing.assert_allclose(splines[::-1, ::-1], splines, atol=1e-12)
+    np.testing.assert_allclose(splines.sum(axis=0), 1)
+    for ends in (slice(0, border + 1), slice(size - 1 - border, size)):
+        assert np.ptp(splines[:, ends], axis=1).max() < 1e-12
+    assert np.ptp(splines[:, border : border + 2], axis=1).max() > 0

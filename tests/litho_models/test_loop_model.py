@@ -20,6 +20,7 @@ from tests.litho_models.loop_scans import (
     PITCH_UM,
     bare_state,
     base_model,
+    blank_scan,
     blank_scans,
     planted,
     study_of,
@@ -281,3 +282,16 @@ def test_what_the_base_took_of_an_effect_does_not_keep_a_fit_from_it(depth_um: f
     state = fit_state(fitted.twin.with_effect(effect.name, ALL, {"": shallow}), study)
     # White noise of 4 nm is left.
     assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.08)
+
+
+def test_effects_know_of_a_scan_what_its_record_says() -> None:
+    facts = {"field_y_um": -4.0, "field_x_um": 3.0, "direction": -1, "tip": 2, "pixel_size": 2.0, "dose": 1.5}
+    write = {"field_um": 100.0, "slow_axis": "x"}
+    (known,) = (one.context for one in prepare_scans([blank_scan(0, 24, write=write, **facts)]))
+    assert known.field_centre_um == (-4, 3)
+    assert (known.field_radius_um, known.slow_axis) == (50, "x")
+    assert (known.backward, known.new_tip, known.pixel_size, known.dose) == (True, True, 2, 1.5)
+    (unsaid,) = (one.context for one in prepare_scans([blank_scan(0, 24)]))
+    assert unsaid.field_centre_um == (0, 0)
+    assert (unsaid.field_radius_um, unsaid.slow_axis) == (None, "y")
+    assert (unsaid.backward, unsaid.new_tip, unsaid.pixel_size, unsaid.dose) == (False, False, 1, 1)

@@ -28,7 +28,7 @@ from litho_models.noise.spread_scores import (
     normalised_calibration_error,
     sparsification_error,
 )
-from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
+from litho_models.noise.staircase import READABLE_AT, _piecewise_constant, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import (
     COVARIATES,
@@ -203,6 +203,12 @@ def test_the_treads_of_a_staircase_are_found(axis):
     assert found == axis
     # The blur of 2.5 px hides the edge by no more than its width.
     assert np.abs(np.array(edges) - [50, 100, 150, 200]).max() <= 2
+
+
+@pytest.mark.parametrize("narrowest", [3, 4, 5, 6])
+def test_no_tread_is_narrower_than_the_narrowest(narrowest):
+    edges = _piecewise_constant(np.repeat([0.0, 0.3, 0.0], [10, 4, 9]), 0.01, narrowest)
+    assert np.diff(edges) == max(4, narrowest)
 
 
 def test_step_heights_readability_and_misreading_follow_from_the_noise():
