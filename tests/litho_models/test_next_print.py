@@ -253,7 +253,7 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
     prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
     twin = rivalry.twins[0]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
-    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).of_labels({})
+    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).chain()
     faded.requires_grad_(False)
     found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
     with torch.no_grad():
@@ -416,7 +416,7 @@ def second_round(
     """Two prints, each scanned at 0 and 90 degrees, an effect of the printer or of the microscope."""
     random = np.random.default_rng(seed)
     [name] = effects
-    chain = rival(name, effects, owner).twin(model({})).of_labels({})
+    chain = rival(name, effects, owner).twin(model({})).chain()
     scans = []
     for number, blank in enumerate(blank_scans(12, 64)[-2:]):
         rough = gaussian_filter(random.normal(size=blank.shape), 1.0)
