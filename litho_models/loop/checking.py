@@ -15,10 +15,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, held_out_maps, without_terms
+from litho_models.loop.fits import State, Study, fit_state, held_out_maps, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.search import Cause, search
+from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
+from litho_models.loop.search import Cause
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -63,8 +64,6 @@ class Check:
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
             reason = f"only resembles the cause: {taken}"
-        elif laws := self._laws_instead(cause.name, without):
-            reason = f"short laws do better in its place: {', '.join(laws)}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
@@ -83,12 +82,33 @@ class Check:
                     return other.name
         return ""
 
-    def _laws_instead(self, name: str, without: State) -> list[str]:
-        """Laws, two at most and with no more numbers, that do better in a cause's place; empty if none."""
-        numbers = sum(slot.effect == name for slot in self.state.twin.slots)
-        laws = search(without, self.study, self.laws, min(numbers, 2), self.secants)
-        better = laws.causes and judge(self.state.freed_nm2, laws.state.freed_nm2, self.study).passed()
-        return laws.names if better else []
+    def beside_laws(self, cause: Cause) -> Cause:
+        """A cause that stands otherwise, held against laws: its name falls if short ones do better.
+
+        Two laws at most, with no more numbers than the cause has.
+        """
+        numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
+        state = self.state.without(cause.name, self.study)
+        laws: list[str] = []
+        while len(laws) < 2 and (law := self._best_law(state, numbers)):
+            state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
+            numbers -= law.numbers
+            laws.append(law.name)
+            if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
+                return replace(cause, reason=f"short laws do better in its place: {', '.join(laws)}")
+        return cause
+
+    def _best_law(self, state: State, numbers: int) -> Screened | None:
+        """The law that promises most, if that is a fair part of what this model lacks beside the cause."""
+        laws = [law for law in self.laws if law.name not in state.twin.names]
+        least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
+        promising = (
+            one
+            for own in Screening(state, self.study, laws, self.secants).candidates.values()
+            for one in own.values()
+            if one.allowed and one.numbers <= numbers and one.gain_nm2 > least
+        )
+        return max(promising, key=lambda one: one.gain_nm2, default=None)
 
 
 def reshaped_gain(without: State, state: State, study: Study) -> float:

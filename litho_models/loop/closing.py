@@ -141,19 +141,18 @@ def _searched(
             others = [*named.causes, *lawful.causes]
             check = Check(in_place, others, laws, rest(in_place).mean_nm2, secants, study)
             named.causes = [check.of(cause) for cause in named.causes]
-        # What may only correct another formula goes first: that formula is then judged without it.
-        wrong = sorted(
-            (one for one in named.causes if one.reason),
-            key=lambda one: (not one.corrects, one.judgement.gain_nm2),
-        )
+            if not any(one.reason for one in named.causes):
+                named.causes = [check.beside_laws(one) for one in named.causes]
+        wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return named, lawful, _in_model(lawful.state, described, study)
-        worst = wrong[0]
-        study.report(f"{worst.name}: {worst.reason}")
-        named.refused[worst.name] = worst.reason
-        named.failed.append(worst)
-        named.causes.remove(worst)
-        named.state = named.state.without(worst.name, study) if named.causes else start
+        # What may only correct another formula goes first: that formula is then judged without it.
+        for one in [one for one in wrong if one.corrects] or wrong[:1]:
+            study.report(f"{one.name}: {one.reason}")
+            named.refused[one.name] = one.reason
+            named.failed.append(one)
+            named.causes.remove(one)
+            named.state = named.state.without(one.name, study) if named.causes else start
 
 
 def _in_model(state: State, described: Sequence[Cause], study: Study) -> Found:

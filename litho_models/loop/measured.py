@@ -51,7 +51,7 @@ def freed_scans(state: State, study: Study) -> list[PrintedScan]:
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Printer and measurement fitted to the same scans, one after the other and once more.
+    """Printer and measurement fitted to the same scans, one after the other, and the strengths once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
@@ -64,5 +64,6 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
         freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        measurement = learn_measurement(stored, [twin.height(scan) for scan in scans], seed=seed)
+        maps = [twin.height(scan) for scan in scans]
+        measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
     return Fit(twin, measurement)

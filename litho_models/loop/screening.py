@@ -16,7 +16,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.fitting.least_squares import gram_inside
 from litho_models.loop.fits import State, Study
-from litho_models.loop.judging import EXCHANGED_P, FAMILY_P
+from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.trials import Secants, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
@@ -113,8 +113,8 @@ class Screening:
                 one, best = self._candidate(trial, by), own.get(by)
                 if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
                     own[by] = one
-        common = np.stack([own[ALL].gains_nm2 for own in found.values()], axis=1)
-        largest = (sign_flips(len(common), self.study.seed) @ common).max(axis=1)
+        common = np.array([own[ALL].gains_nm2 for own in found.values()]).T
+        largest = (sign_flips(len(common), self.study.seed) @ common).max(axis=1) if found else common
 
         def judged(one: Screened) -> Screened:
             reached = largest >= one.gains_nm2.sum() * (1 - 1e-9)
@@ -133,7 +133,7 @@ class Screening:
         for own in self.candidates.values():
             grouped = self._grouped(own)
             chosen = grouped or own[ALL]
-            worth = chosen.gain_nm2 >= WORTH_FITTING * 0.01 * self._mse_nm2
+            worth = chosen.gain_nm2 >= WORTH_FITTING * SMALLEST_SHARE * self._mse_nm2
             if not chosen.allowed or chosen.retained < SMALLEST_RETAINED or not worth:
                 continue
             if grouped or chosen.family_p <= FAMILY_P:
@@ -142,7 +142,7 @@ class Screening:
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
         """The grouping of a strength that gains beyond chance over one strength for all, or None."""
-        least = max(own[ALL].gain_nm2, 0.0) + 0.01 * self._mse_nm2
+        least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
         best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})
         if best is None:

@@ -96,7 +96,7 @@ def describe(
 ) -> list[Cause]:
     """Tables that stand out beside a model, each as a linear fit beside it alone."""
     found: list[Cause] = []
-    for one in Screening(state, study, tables, secants).standing()[:most] if tables else ():
+    for one in Screening(state, study, tables, secants).standing()[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
         if judgement.passed(grouped=one.by != ALL):
             found.append(Cause(one.name, one.by, (), judgement, one.family_p, one.group_p, one.start()))
