@@ -15,10 +15,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, held_out_maps, without_terms
+from litho_models.loop.fits import State, Study, fit_state, held_out_maps, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.search import Cause, search
+from litho_models.loop.screening import Screened, Screening
+from litho_models.loop.search import WORTH_FITTING, Cause
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -80,8 +81,6 @@ class Check:
         if share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
             return Checked(cause, share, f"only resembles the cause: {taken}")
-        if laws := self._laws_instead(cause.name, without):
-            return Checked(cause, share, f"short laws do better in its place: {', '.join(laws)}")
         return Checked(cause, share, "")
 
     def _larger(self, cause: Cause, without: State) -> str:
@@ -100,12 +99,34 @@ class Check:
                     return other.name
         return ""
 
-    def _laws_instead(self, name: str, without: State) -> list[str]:
-        """Laws, two at most and with no more numbers, that do better in a cause's place; empty if none."""
+    def beside_laws(self, checked: Checked) -> Checked:
+        """A cause that stands otherwise, held against laws: its name falls if short ones do better.
+
+        Two laws at most, with no more numbers than the cause has.
+        """
+        name = checked.cause.name
         numbers = sum(slot.effect == name for slot in self.state.twin.slots)
-        laws = search(without, self.study, self.laws, min(numbers, 2), self.secants)
-        better = laws.causes and judge(self.state.freed_nm2, laws.state.freed_nm2, self.study).passed()
-        return laws.names if better else []
+        state = self.state.without(name, self.study)
+        laws: list[str] = []
+        while len(laws) < 2 and (law := self._best_law(state, numbers)):
+            state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
+            numbers -= law.numbers
+            laws.append(law.name)
+            if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
+                return replace(checked, reason=f"short laws do better in its place: {', '.join(laws)}")
+        return checked
+
+    def _best_law(self, state: State, numbers: int) -> Screened | None:
+        """The law that promises most, if that is a fair part of what this model lacks beside the cause."""
+        laws = [law for law in self.laws if law.name not in state.twin.names]
+        promising = (
+            one
+            for one in Screening(state, self.study, laws, self.secants).candidates
+            if one.allowed
+            and one.numbers <= numbers
+            and one.gain_nm2 > WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
+        )
+        return next(promising, None)
 
 
 def reshaped_gain(without: State, state: State, study: Study) -> float:
@@ -133,12 +154,10 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
 
-    def blurred(field: np.ndarray, sigma_um: float) -> np.ndarray:
-        return gaussian_filter(field, sigma_um / pitch)
-
-    near, far = blurred(layout, 0.6), blurred(layout, 2.0)
+    # Widths in pixels, which are small beside what the process resolves, on films of nanometres too.
+    near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
-    soft = [blurred(change, sigma_um) for sigma_um in (0.2, 0.6, 1.6)]
+    soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]
     y, x = (np.linspace(-1, 1, size) for size in change.shape)
     place = y[:, None], x, y[:, None] ** 2 + x**2
     factors = (1.0, relative, relative**2, np.abs(change), near, far, near - layout, *place)

@@ -164,20 +164,24 @@ def _chosen(
             left_nm2 = learner().rest(held_out_maps(in_place.per_fold, study, study.scans)).mean_nm2
             check = Check(in_place, [*named.causes, *lawful.causes], laws, left_nm2, secants, study)
             checked = [check.of(cause) for cause in named.causes]
+            if not any(one.reason for one in checked):
+                checked = [check.beside_laws(one) for one in checked]
             named.causes = [one.cause for one in checked]
-        # What may only correct another formula goes first: that formula is then judged without it.
-        wrong = sorted(
-            (one for one in checked if one.reason),
-            key=lambda one: (not one.corrects, one.cause.judgement.gain_nm2),
-        )
+        wrong = [one for one in checked if one.reason]
         if not wrong:
             return Chosen(named, [*checked, *failed], lawful, _in_model(lawful.state, described, study))
-        name, reason = wrong[0].cause.name, wrong[0].reason
-        study.report(f"{name}: {reason}")
-        failed.append(wrong[0])
-        named.refused[name] = reason
-        named.causes = [cause for cause in named.causes if cause.name != name]
-        named.state = named.state.without(name, study) if named.causes else start
+        # What may only correct another formula goes first: that formula is then judged without it.
+        wrong.sort(key=lambda one: one.cause.judgement.gain_nm2)
+        out = [one for one in wrong if one.corrects] or wrong[:1]
+        for one in out:
+            study.report(f"{one.cause.name}: {one.reason}")
+            named.refused[one.cause.name] = one.reason
+            named.state = named.state.without(one.cause.name, study)
+        failed += out
+        names = {one.cause.name for one in out}
+        named.causes = [cause for cause in named.causes if cause.name not in names]
+        if not named.causes:
+            named.state = start
 
 
 def _in_model(state: State, described: Sequence[Cause], study: Study) -> Found:
@@ -243,7 +247,7 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Printer and measurement fitted to the same scans, one after the other and once more.
+    """Printer and measurement fitted to the same scans, one after the other, and the strengths once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
@@ -251,15 +255,15 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
     """
     stored = [scan.stored for scan in scans]
 
-    def learned() -> tuple[MeasurementModel, list[np.ndarray]]:
+    def learned(like: MeasurementModel | None = None) -> tuple[MeasurementModel, list[np.ndarray]]:
         placed = twin.placed()
         maps = [placed.height(scan) for scan in scans]
-        return learn_measurement(stored, maps, seed=seed), maps
+        return learn_measurement(stored, maps, seed=seed, like=like), maps
 
     measurement, maps = learned()
     if refit and len(twin.vector):
         freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        measurement, _ = learned()
+        measurement, _ = learned(like=measurement)
     return Fit(twin, measurement)

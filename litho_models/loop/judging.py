@@ -17,8 +17,9 @@ CONFIRM_P = 0.005
 FEWEST_SCANS = 8
 # A strength by group was held against exchanged labels already: half of the scans may have nothing to gain.
 GROUPED_P = 0.05
+# Of the squared error: what is worth a strength by group, or a search. A change of the model has to take
+# twice that, one percent of the root: its form is always wrong by a little.
 SMALLEST_SHARE = 0.01
-SMALLEST_RMSE_NM = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,7 @@ class Judgement:
     @property
     def matters(self) -> bool:
         """Large enough to be of use."""
-        rmse = np.sqrt(self.before_nm2) - np.sqrt(max(self.before_nm2 - self.gain_nm2, 0.0))
-        return self.gain_nm2 >= SMALLEST_SHARE * self.before_nm2 or rmse >= SMALLEST_RMSE_NM
+        return self.gain_nm2 >= 2 * SMALLEST_SHARE * self.before_nm2
 
     def passed(self, *, grouped: bool = False) -> bool:
         """Whether it is confirmed."""

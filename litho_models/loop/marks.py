@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.judging import CONFIRM_P, SMALLEST_RMSE_NM
+from litho_models.loop.judging import CONFIRM_P
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding
 from litho_models.scan_terms import POLICIES, freed_um, row_index
@@ -20,6 +20,8 @@ from litho_models.scoring.statistics import one_sided_flip_p
 
 # Beyond the sharpness of tip and spot, and within the length of a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
+# Less is there, and does not matter.
+_SMALLEST_RMS_NM = 0.5
 
 
 def marks(
@@ -74,7 +76,7 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
             f"the raw heights of {len(rounded)} of {len(steps_nm)} scans are multiples of "
             f"{np.median(rounded):.3g} nm, which adds {noise_nm:.2g} nm rms"
         )
-    return ScanFinding.of("quantisation", evidence, seen=noise_nm >= SMALLEST_RMSE_NM)
+    return ScanFinding.of("quantisation", evidence, seen=noise_nm >= _SMALLEST_RMS_NM)
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
@@ -118,7 +120,7 @@ def _short_lines(
         f"along the lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
         f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
     )
-    return ScanFinding.of("line-roughness", text, seen=p <= CONFIRM_P and rms_nm >= SMALLEST_RMSE_NM, p=p)
+    return ScanFinding.of("line-roughness", text, seen=p <= CONFIRM_P and rms_nm >= _SMALLEST_RMS_NM, p=p)
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:

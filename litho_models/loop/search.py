@@ -15,7 +15,15 @@ import numpy as np
 from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, GROUPED_P, Judgement, judge, told_apart
+from litho_models.loop.judging import (
+    EXCHANGED_P,
+    FAMILY_P,
+    GROUPED_P,
+    SMALLEST_SHARE,
+    Judgement,
+    judge,
+    told_apart,
+)
 from litho_models.loop.regrouping import best_grouping, regrouped
 from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening
 from litho_models.loop.trials import Secants
@@ -189,7 +197,7 @@ def _standing(screening: Screening, found: Found) -> list[Screened]:
     for one in screening.candidates:
         by_name.setdefault(one.name, []).append(one)
     mse = found.state.mse_nm2
-    worth = WORTH_FITTING * 0.01 * mse
+    worth = WORTH_FITTING * SMALLEST_SHARE * mse
     standing = []
     for name, own in by_name.items():
         common = next(one for one in own if one.by == ALL)
@@ -209,7 +217,7 @@ def _grouped(
     own: Sequence[Screened], common: Screened, screening: Screening, mse_nm2: float
 ) -> Screened | None:
     """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
-    least = max(common.gain_nm2, 0.0) + 0.01 * mse_nm2
+    least = max(common.gain_nm2, 0.0) + SMALLEST_SHARE * mse_nm2
     better = {one.by: one for one in own if one.by != ALL and one.allowed and one.gain_nm2 > least}
     by = best_grouping(
         {by: one.gain_nm2 for by, one in better.items()}, {by: one.numbers for by, one in better.items()}

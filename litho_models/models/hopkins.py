@@ -9,6 +9,7 @@ thesis, Berkeley 1998).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ from litho_data.foundation.errors import InputError
 
 # Of λ / NA: beyond it a kernel is cut off.
 _REACH = 4.0
+# Points along each side of a frequency's cell, by which its share of the source is counted; odd, for a point.
+_COUNTED = 9
 
 
 class Optics(NamedTuple):
@@ -67,30 +70,42 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
 def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
     """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
 
-    Source points lie on the grid of the field's frequencies.
+    Source points lie on the grid of the field's frequencies, each as bright as its cell is filled.
 
     Raises:
-        InputError: a ring between two of them.
+        InputError: a ring too thin to fill any.
     """
     fy, fx = (np.fft.fftfreq(n, pitch_um) for n in shape)
     y, x = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
     cutoff = optics.na / optics.wavelength_um
-    radius = np.hypot(y, x) / cutoff
-    source = np.flatnonzero((radius <= optics.outer + 1e-9) & (radius >= optics.inner - 1e-9))
+    filled = _filled(y / cutoff, x / cutoff, [1 / (n * pitch_um * cutoff) for n in shape], optics)
+    source = np.flatnonzero(filled)
     if not len(source):
         raise InputError(
             "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
         )
     # What no source point brings into the pupil is dark in all kernels.
-    bright = np.flatnonzero(radius <= 1 + optics.outer + 1e-9)
+    reach = 1 + np.hypot(y[source], x[source]).max() / cutoff
+    bright = np.flatnonzero(np.hypot(y, x) / cutoff <= reach + 1e-9)
     shifted = y[source, None] + y[bright], x[source, None] + x[bright]
-    waves = _pupil(*shifted, optics)
+    waves = np.sqrt(filled[source])[:, None] * _pupil(*shifted, optics)
     values, vectors = np.linalg.svd(waves, full_matrices=False)[1:]
     open_frame = np.sum(np.abs(waves[:, bright == 0]) ** 2)
     count = min(optics.kernels, len(values))
     found = np.zeros((count, len(y)), np.complex128)
     found[:, bright] = values[:count, None] * vectors[:count] / np.sqrt(open_frame)
     return found.reshape(count, *shape)
+
+
+def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics) -> np.ndarray:
+    """Share of the cells (y, x) around frequencies, relative to the pupil, that the source fills."""
+    inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
+    filled = np.zeros(len(y))
+    for by_y in inside * cell[0]:
+        for by_x in inside * cell[1]:
+            radius = np.hypot(y + by_y, x + by_x)
+            filled += (radius <= optics.outer + 1e-9) & (radius >= optics.inner - 1e-9)
+    return filled / _COUNTED**2
 
 
 def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:

@@ -58,24 +58,33 @@ _Pair = tuple[PrintedScan, np.ndarray]
 
 
 def learn_measurement(
-    scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, seed: int = 0
+    scans: Sequence[PrintedScan],
+    predictions_um: Sequence[np.ndarray],
+    *,
+    seed: int = 0,
+    like: MeasurementModel | None = None,
 ) -> MeasurementModel:
     """Choose and fit what these scans share beside the predicted prints (ny, nx), µm.
 
     Parts are added one at a time as long as they lower the error on scans that they were not fitted to, dealt
     into folds among these scans, and only if they do so beyond the scatter over scans. Where fields differ in
     size, those of the most frequent one are learned from. Micrographs of films share nothing of the kind.
+
+    Args:
+        like: a model whose levelling and parts are taken, with strengths that are fitted anew.
     """
     usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
     model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
     if scans[0].seen_by == "sem":
         return model
     pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
-    model = model.model_copy(update={"levelling": _best_levelling(pairs, model), "scans": len(pairs)})
-    chosen: list[_Offer] = []
+    levelling = like.levelling if like else _best_levelling(pairs)
+    model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
+    chosen = [_offer(part.what, part.degree, part.by, part.shrinking) for part in like.parts] if like else []
     for _ in range(_ROUNDS):
         products = _products(pairs, model)
-        chosen = chosen or _chosen(products, _deal([scan.id for scan, _ in pairs], seed))
+        if not (chosen or like):
+            chosen = _chosen(products, _deal([scan.id for scan, _ in pairs], seed))
         model = model.model_copy(update={"parts": _fitted(products, chosen)})
         if not chosen:
             break
@@ -112,12 +121,16 @@ def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
 def _offers(groups: Iterable[str], chosen: Sequence[_Offer]) -> list[_Offer]:
     taken = {(what, block.by) for what, _, block in chosen}
     return [
-        (what, degree, Block(_columns_of(what, degree), by, shrinking))
+        _offer(what, degree, by, shrinking)
         for what, degree, grouped in _OFFERS
         for by in groups
         if (by != ALL) == grouped and (what, by) not in taken
         for shrinking in (_SHRINKING if grouped else _SHRINKING[:1])
     ]
+
+
+def _offer(what: Shared, degree: int, by: str, shrinking: float) -> _Offer:
+    return what, degree, Block(_columns_of(what, degree), by, shrinking)
 
 
 def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
@@ -144,18 +157,21 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
     slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
-    shapes = polynomials(scan.shape, _HIGHEST).reshape(polynomial_count(_HIGHEST), -1)[:, at]
-    residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
-    own = shapes[: polynomial_count(_LATERAL)]
-    moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
+    count, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
+    rows = np.empty((count + 2 * lateral + 1, len(at)))
+    np.take(polynomials(scan.shape, _HIGHEST).reshape(count, -1), at, 1, out=rows[:count], mode="clip")
     # A background is added after the levelling, so that it is not levelled itself.
-    surface = shapes[[0, *LEVELLED[model.levelling]]]
+    surface, moved = rows[[0, *LEVELLED[model.levelling]]], rows[count:]
+    np.multiply(rows[:lateral], slope_x, out=moved[:lateral])
+    np.multiply(rows[:lateral], slope_y, out=moved[lateral:-1])
+    moved[-1] = seen.reshape(-1)[at]
     moved -= least_squares(surface, moved.T).T @ surface
-    rows = np.concatenate([residual[None], shapes[1:], moved])
+    rows[0] = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
     for part in model.parts:
         if known := part.of(scan):
             rows[0] += known @ rows[list(_columns_of(part.what, part.degree))]
-    return rows - rows.mean(axis=1, keepdims=True)
+    rows -= rows.mean(axis=1, keepdims=True)
+    return rows
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
@@ -171,23 +187,22 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
     return tuple(range(starts[what], starts[what] + count))
 
 
-def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levelling:
+def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
     """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
+    rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
+    for scan, prediction in pairs:
+        at = thinned(scan.usable, _SAMPLED_PX)
+        shapes = polynomials(scan.shape, 2).reshape(polynomial_count(2), -1)[:, at]
+        height, expected = (
+            np.asarray(one, np.float64).reshape(-1)[at] for one in (scan.height_um, prediction)
+        )
+        for levelling, own in LEVELLED.items():
+            surface = shapes[[0, *own]]
+            seen = expected - least_squares(surface, expected) @ surface
+            rests[levelling].append(least_squares(shapes, height - seen))
     # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
-
-    def error(levelling: Levelling) -> float:
-        levelled = model.model_copy(update={"levelling": levelling})
-        rests = []
-        for scan, prediction in pairs:
-            at = thinned(scan.usable, _SAMPLED_PX)
-            rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
-            rests.append(
-                least_squares(polynomials(scan.shape, 2).reshape(polynomial_count(2), -1)[:, at], rest)
-            )
-        return float((np.var(rests, axis=0) * weights)[1:].sum())
-
-    return min(LEVELLED, key=error)
+    return min(LEVELLED, key=lambda one: float((np.var(rests[one], axis=0) * weights)[1:].sum()))
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
