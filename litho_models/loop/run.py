@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from torch import nn
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
@@ -191,7 +192,7 @@ def _nested(
     close_again, often = _again(base, study), Counter[str]()
 
     def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
-        for number, out in enumerate(parts, 1):
+        for number, out in enumerate(progress(parts, "choosing anew"), 1):
             study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)
