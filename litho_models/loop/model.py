@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from litho_models.effects import Parameter, get_effect
-from litho_models.effects.chain import EffectChain
+from litho_models.effects.chain import EffectChain, Frame
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
@@ -48,9 +49,7 @@ class Twin:
         choices: effect to the values of parameters that are never fitted (a direction).
         slots: the fitted numbers of the effects, in the order of ``vector``, after those of the base.
         vector: all fitted numbers.
-        full_height_um, pitch_um: of the layouts.
-        scan_frame, print_frame: effects that turn with the scan, or keep to the print, whatever the catalogue
-            says; see ``EffectChain``.
+        frames: what an effect turns with, where it is not what the catalogue says; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -58,20 +57,15 @@ class Twin:
     choices: Mapping[str, Mapping[str, float]]
     slots: tuple[Slot, ...]
     vector: np.ndarray
-    full_height_um: float
-    pitch_um: float
-    scan_frame: frozenset[str] = frozenset()
-    print_frame: frozenset[str] = frozenset()
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    _chains: dict[tuple[str, ...], EffectChain] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
-    def bare(cls, base: nn.Module, scan: PreparedScan) -> Twin:
-        """The base alone, for scans like this one."""
-        return cls.of_base(base, scan.context.full_height_um, scan.context.pitch_um)
-
-    @classmethod
-    def of_base(cls, base: nn.Module, full_height_um: float, pitch_um: float) -> Twin:
-        """The base alone, for layouts of this height and pitch."""
-        return cls(base, {}, {}, (), _numbers(base), full_height_um, pitch_um)
+    def bare(cls, base: nn.Module) -> Twin:
+        """The base alone."""
+        return cls(base, {}, {}, (), _numbers(base))
 
     @property
     def own(self) -> int:
@@ -141,10 +135,9 @@ class Twin:
             twin = twin.with_effect(name, ALL, {"": values})
         return twin
 
-    def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
+    def over(self, base: nn.Module) -> Twin:
         """The same effects over another base."""
-        vector = np.concatenate([Twin.bare(base, scan).vector, self.vector[self.own :]])
-        return replace(self, base=base, vector=vector)
+        return replace(self, base=base, vector=np.concatenate([_numbers(base), self.vector[self.own :]]))
 
     def with_base_unfitted(self) -> np.ndarray:
         """The numbers with the base's as they are before any fit."""
@@ -191,9 +184,50 @@ class Twin:
                 vector[self.own + at] = np.mean(alike) if alike else slot.facts.null
         return self.at(vector)
 
-    def placed(self) -> Placed:
-        """The model at its numbers, ready to predict; the twin keeps a base of its own."""
-        return Placed(self)
+    @cached_property
+    def fitted_base(self) -> nn.Module:
+        """The base at its numbers: a copy of its own, where it has any."""
+        if not self.own:
+            return self.base
+        base, at = copy.deepcopy(self.base), 0
+        for parameter in _parameters(base):
+            values = self.vector[at : at + parameter.numel()]
+            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
+            at += parameter.numel()
+        return base
+
+    def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
+        """The chain of effects as it is for one scan, or with mean strengths; ``extra``: tried on top."""
+        labels = {} if scan is None else self.labels(scan)
+        key = tuple(labels.values())
+        if extra or key not in self._chains:
+            values = {**self.values(labels), **(extra or {})}
+            chain = EffectChain(self.fitted_base, values, frames=self.frames)
+            if extra:
+                return chain
+            self._chains[key] = chain
+        return self._chains[key]
+
+    @torch.no_grad()
+    def exposed(self, scan: PreparedScan) -> Tensor:
+        """The layout (1, 1, y, x), µm, with the effects that act on it."""
+        return self.chain(scan).before_base(scan.context.layout_um, scan.context)
+
+    @torch.no_grad()
+    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
+        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
+        base = self.fitted_base
+        return (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
+
+    @torch.no_grad()
+    def height(
+        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
+    ) -> np.ndarray:
+        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
+        chain = self.chain(scan, extra)
+        if base_um is None:
+            base_um = self.base_height(chain.before_base(scan.context.layout_um, scan.context), scan)
+        return chain.after_base(base_um, scan.context)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
         """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
@@ -230,8 +264,8 @@ class Twin:
 
     def at_bounds(self) -> dict[str, float]:
         """Fitted values of base and effects that stand on a bound of their range, and that bound."""
-        placed = self.placed().base
-        found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
+        base = self.fitted_base
+        found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
@@ -247,60 +281,6 @@ class Twin:
             for bound in (slot.facts.lower, slot.facts.upper)
             if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound))
         ]
-
-
-class Placed:
-    """A twin at its numbers; the base is a copy of its own."""
-
-    def __init__(self, twin: Twin):
-        self.twin = twin
-        self.base = copy.deepcopy(twin.base) if twin.own else twin.base
-        at = 0
-        for parameter in _parameters(self.base) if twin.own else ():
-            values = twin.vector[at : at + parameter.numel()]
-            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
-            at += parameter.numel()
-        self._chains: dict[tuple[tuple[str, str], ...], EffectChain] = {}
-
-    def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
-        """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
-        labels = tuple(self.twin.labels(scan).items())
-        if extra is not None:
-            return self.of_labels(labels, extra)
-        if labels not in self._chains:
-            self._chains[labels] = self.of_labels(labels)
-        return self._chains[labels]
-
-    def of_labels(self, labels: tuple[tuple[str, str], ...] = (), extra: Values | None = None) -> EffectChain:
-        """The chain for scans with these labels, by grouping; without any it has the mean strengths."""
-        return EffectChain(
-            self.base,
-            {**self.twin.values(dict(labels)), **(extra or {})},
-            full_height_um=self.twin.full_height_um,
-            pitch_um=self.twin.pitch_um,
-            scan_frame=self.twin.scan_frame,
-            print_frame=self.twin.print_frame,
-        )
-
-    @torch.no_grad()
-    def exposed(self, scan: PreparedScan, extra: Values | None = None) -> Tensor:
-        """The layout (1, 1, y, x), µm, with the effects that act on it."""
-        return self.chain(scan, extra).before_base(scan.context.layout_um, scan.context)
-
-    @torch.no_grad()
-    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
-        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
-        base = self.base.of_scan(scan.id) if isinstance(self.base, FoldedBase) else self.base
-        return base(exposed_um)
-
-    @torch.no_grad()
-    def height(
-        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
-    ) -> np.ndarray:
-        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
-        if base_um is None:
-            base_um = self.base_height(self.exposed(scan, extra), scan)
-        return self.chain(scan, extra).after_base(base_um, scan.context)[0, 0].numpy()
 
 
 def is_refitted(base: nn.Module) -> bool:

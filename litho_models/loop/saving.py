@@ -30,7 +30,7 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
     """The corrected model of the printer, with the strengths that the latest scan has."""
     twin = closed.final.twin
-    base = twin.placed().base
+    base = twin.fitted_base
     if isinstance(base, FoldedBase):
         base = base.common
     assert isinstance(base, Simulator)
@@ -39,10 +39,8 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     sides = {"process": "printer", "measurement": "microscope"}
     by_side: dict[str, Values] = {f"{side}_effects": {} for side in (*sides, "undetermined")}
     for one in result.effects:
-        if one.name in values:
-            by_side[f"{one.role if one.role in sides else 'undetermined'}_effects"][one.name] = values[
-                one.name
-            ]
+        side = one.role if one.role in sides else "undetermined"
+        by_side[f"{side}_effects"][one.name] = values[one.name]
     error = result.error("all")
     assert error is not None
     save_frozen(
@@ -61,8 +59,8 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
             **result.split.model_dump(mode="json"),
             "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
         },
-        training_level_share=level_share([scan.stored for scan in closed.original]),
-        training_step_share=step_share([scan.stored for scan in closed.original]),
+        training_level_share=level_share([scan.stored for scan in closed.given.scans]),
+        training_step_share=step_share([scan.stored for scan in closed.given.scans]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
             {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},

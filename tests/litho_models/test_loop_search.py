@@ -100,7 +100,7 @@ def test_nothing_is_found_in_noise(seed: int) -> None:
     found = found_in(seed=seed)
     assert found.names == []
     assert found.state.twin.names == ()
-    assert set(found.family_p) == {effect.name for effect in CANDIDATES}
+    assert set(found.first) == {effect.name for effect in CANDIDATES}
 
 
 def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
@@ -137,7 +137,7 @@ def test_a_cause_that_another_resembles_is_found(
         [(name, ALL, {"": effect.with_values(values)})], base=base, count=FEWEST_SCANS, size_px=64
     )
     study = study_of(scans)
-    start = fit_state(Twin.bare(build_model("physics"), study.scans[0]), study)
+    start = fit_state(Twin.bare(build_model("physics")), study)
     found = search(start, study, [effect, *map(get_effect, beside)])
     assert found.names == [name]
     assert found.causes[0].alike == ()
