@@ -2,8 +2,10 @@
 
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,6 +14,9 @@ from litho_data.foundation.run_facts import running_command
 T = TypeVar("T")
 # Shortest time to estimate from, and shortest remaining time that is reported.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
+# Five seconds, with the time that a command takes to start.
+_SILENT_S = 3.0
+_silent = threading.Event()
 
 
 def run_script(main: Callable[[], T]) -> T:
@@ -76,7 +81,26 @@ def progress(
 
 def say(what: str) -> None:
     """Print one line on stderr before the work that it names, so that the user knows what they wait for."""
+    _silent.clear()
     print(what, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def never_silent(name: str) -> Iterator[None]:
+    """Print that a command is at work if it prints nothing else in its first seconds."""
+
+    def speak() -> None:
+        if _silent.is_set():
+            say(f"{name} is at work")
+
+    _silent.set()
+    waiting = threading.Timer(_SILENT_S, speak)
+    waiting.daemon = True
+    waiting.start()
+    try:
+        yield
+    finally:
+        waiting.cancel()
 
 
 def say_estimate(what: str, seconds: float) -> None:

@@ -71,8 +71,7 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine: process, sampling, film, beam (sd) or lens, threshold of the resist relative to full
-    dose."""
+    """A machine: process, sampling, film, beam (sd) or lens, relative resist threshold."""
 
     process: Literal["e-beam", "projection"]
     pitch_um: float
