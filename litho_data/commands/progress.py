@@ -14,7 +14,8 @@ from litho_data.foundation.run_facts import running_command
 T = TypeVar("T")
 # What items take in this time tells what the others will, and what is too short to be told.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-_SILENT_S = 4.0
+# With what a command takes to start, five seconds.
+_SILENT_S = 3.0
 _silent = threading.Event()
 
 
