@@ -30,7 +30,6 @@ from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
 from litho_models.loop.closing import close
 from litho_models.loop.fits import Study
-from litho_models.loop.run import dealt
 from litho_models.models import build_model
 
 PAGE = Path(__file__).parents[1] / "docs" / "closing_the_loop.md"
@@ -71,9 +70,7 @@ def main() -> None:
 def calibrate_one(seed: int) -> dict[str, Any]:
     """What the loop takes on one store, and its error before and after, nm."""
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
-    scans = null_scans(seed)
-    fold_of = dealt(scans, FOLDS, 0)
-    closed = close(scans, fold_of, base, Study((), fold_of))
+    closed = close(Study.dealt(null_scans(seed), FOLDS), {"physics": base})
     return {
         "seed": seed,
         "found": [cause.name for cause in closed.traced],

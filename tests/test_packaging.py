@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -87,8 +88,19 @@ def test_the_wheel_designs_a_hologram_from_an_empty_folder(tmp_path: Path) -> No
 
 def test_versions_and_names_agree() -> None:
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
-    assert f"version: {PROJECT['version']}\n" in citation
+    assert re.search(rf"\nversion: {PROJECT['version']}\ndate-released: \d{{4}}-\d\d-\d\d\n", citation)
     assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
     assert litho_data.__version__ == PROJECT["version"]
     core = " ".join(PROJECT["dependencies"])
     assert not [name for name in ("torch", "lightning", "safetensors") if f"{name}>" in core]
+
+
+def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_path: Path) -> None:
+    workflow = (ROOT / ".github/workflows/release.yml").read_text("utf-8")
+    (script,) = re.findall(r"name: links\n +run: \|\n(.*?)\n +- run", workflow, re.DOTALL)
+    shutil.copy(ROOT / "README.md", tmp_path)
+    names = {"GITHUB_REPOSITORY": "owner/name", "GITHUB_REF_NAME": "v1"}
+    subprocess.run(["bash", "-euc", script], cwd=tmp_path, env=os.environ | names, check=True)
+    page = (tmp_path / "README.md").read_text("utf-8")
+    assert [link for link in re.findall(r"\]\(([^)]+)\)", page) if not link.startswith("https://")] == []
+    assert "](https://raw.githubusercontent.com/owner/name/v1/docs/results/first/first.jpg)" in page

@@ -152,6 +152,17 @@ def quadrants(record: dict[str, Any]) -> list[str]:
     ]
 
 
+def papers_pbl(record: dict[str, Any]) -> list[str]:
+    names = {"none": "none", "physics": "Physics", "pbl": "our PBL", "paper": "paper's PBL"}
+
+    def line(judge: str) -> str:
+        rows = [row for row in record["rows"] if row["printed_by"] == judge != row["designed_with"]]
+        rows.sort(key=lambda row: row["si_psnr_db"])
+        return ", ".join(f"{names[row['designed_with']]} {row['si_psnr_db']:.1f}" for row in rows)
+
+    return [f"printed by the FNO: {line('fno')}; printed by Physics: {line('physics')} |"]
+
+
 QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
     "photographs/photographs.json": ("scores.md", photographs),
     "mixed-up/mixed_up.json": ("own_data.md", mixed_up),
@@ -165,6 +176,7 @@ QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
     "large/pbl.json": ("large.md", large),
     "gap/paper_search.json": ("gap.md", papers_search),
     "paper/pairs.json": ("paper.md", quadrants),
+    "paper/paper_pbl.json": ("paper.md", papers_pbl),
 }
 
 

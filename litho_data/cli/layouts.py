@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from litho_data.commands.app import option
+from litho_data.foundation.quantities import LENGTH_UM
 
 
 def _list_patterns(wanted: bool) -> None:
@@ -153,8 +154,8 @@ def simulate(
     chosen = named_preset(preset)
     printer = chosen.printer
     if stitch_field_um is not None:
-        if not stitch_field_um >= printer.pitch_um:
-            wanted = f"at least the pitch, {printer.pitch_um:g} µm"
+        if not printer.pitch_um <= stitch_field_um <= LENGTH_UM.high:
+            wanted = f"the pitch, {printer.pitch_um:g} µm, or more, and at most {LENGTH_UM.high:g} µm"
             raise InputError("--stitch-field-um", got=stitch_field_um, wanted=wanted)
         printer = replace(printer, stitch_field_um=stitch_field_um)
     card = simulate(

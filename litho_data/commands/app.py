@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from litho_data.commands.progress import command_line, given_words
+from litho_data.commands.progress import command_line, given_words, never_silent
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.plugins import OPTION, load_plugins, without_plugins
 from litho_data.foundation.run_facts import running_command
@@ -148,7 +148,7 @@ def run_app(app: typer.Typer, name: str) -> None:
             # Not every terminal has a µ.
             stream.reconfigure(errors="replace")
     try:
-        with running_command(command_line(name)):
+        with running_command(command_line(name)), never_silent(name):
             words, files = without_plugins(given_words())
             load_plugins(files)
             code = app(words, prog_name=name, standalone_mode=False)

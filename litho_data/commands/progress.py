@@ -2,8 +2,10 @@
 
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,6 +14,9 @@ from litho_data.foundation.run_facts import running_command
 T = TypeVar("T")
 # What items take in this time tells what the others will, and what is too short to be told.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
+# With what a command takes to start, five seconds.
+_SILENT_S = 3.0
+_silent = threading.Event()
 
 
 def run_script(main: Callable[[], T]) -> T:
@@ -76,7 +81,26 @@ def progress(
 
 def say(what: str) -> None:
     """One line on stderr, before the work that it names: whoever waits knows what for."""
+    _silent.clear()
     print(what, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def never_silent(name: str) -> Iterator[None]:
+    """Say that a command is at work, if it says nothing itself in its first seconds."""
+
+    def speak() -> None:
+        if _silent.is_set():
+            say(f"{name} is at work")
+
+    _silent.set()
+    waiting = threading.Timer(_SILENT_S, speak)
+    waiting.daemon = True
+    waiting.start()
+    try:
+        yield
+    finally:
+        waiting.cancel()
 
 
 def say_estimate(what: str, seconds: float) -> None:

@@ -27,7 +27,7 @@ _MAX_SCANS_SHOWN = 48
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",
-    "raw (nm; grey of a micrograph)": "cividis",
+    "raw": "cividis",
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
@@ -135,7 +135,8 @@ def _pictures(page: Page, store: Store) -> None:
         columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
         pictures.append([coloured_png(image, colours, low, high) for image in images])
     caption = (
-        "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
+        "Raw: the scan in its own frame, nm (a micrograph: grey). Registered: on the layout's grid, empty "
+        "where not measured. "
         "Residual: registered height minus the blurred layout, with the best gain and offset. "
         "One colour scale per column."
     )

@@ -283,10 +283,13 @@ def _settings(
 
 def _print_comparison(result: GapResult, out: Path) -> None:
     from litho_design.judging.loaded import task_named
+    from litho_design.reports.advice import called, named
 
-    for item in result.summary:
-        if item.figure == task_named(result.task).headline[0]:
-            print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
+    figure = task_named(result.task).headline[0]
+    for judge in result.judges:
+        found = [item for item in result.summary if (item.judge, item.figure) == (judge, figure)]
+        told = ", ".join(f"{called(item.arm)} {item.judged_mean:.3f}" for item in found)
+        print(f"{named(figure)}, printed by {called(judge)}: designed with {told}")
     print(out / "report.html")
 
 

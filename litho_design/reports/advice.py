@@ -50,6 +50,11 @@ def named(figure: str) -> str:
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
+def called(printer: str) -> str:
+    """A printer in a sentence."""
+    return "nominal heights" if printer == "none" else printer
+
+
 def distribution_warning(design: Design) -> str:
     """A warning where a layout is far from the training layouts, or where that is unknown; else empty."""
     gauge = design.out_of_distribution

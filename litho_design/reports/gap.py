@@ -14,7 +14,7 @@ from litho_design.judging.gap import GapResult, PairedDifference, design_folder
 from litho_design.judging.loaded import LoadedDesign, task_named
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.advice import WORDS, baseline_line, named
+from litho_design.reports.advice import WORDS, baseline_line, called, named
 from litho_design.reports.parts import meanings, picture_grid
 from litho_design.tasks.design import Design
 
@@ -105,7 +105,8 @@ def _verdict(result: GapResult, figure: str) -> str:
         found = {i.arm: i.judged_mean for i in result.summary if (i.judge, i.figure) == (judge, figure)}
         ranking = sorted(found, key=lambda arm: -sign * found[arm])
         text = (
-            f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.4g}{unit}"
+            f"Printed by {called(judge)}, layouts designed with {called(ranking[0])} are best: "
+            f"{found[ranking[0]]:.4g}{unit}"
         )
         if len(ranking) > 1:
             pair = next(
@@ -113,7 +114,7 @@ def _verdict(result: GapResult, figure: str) -> str:
                 for i in result.paired
                 if (i.judge, i.figure) == (judge, figure) and {i.arm, i.against} == set(ranking[:2])
             )
-            text += f", against {found[ranking[1]]:.4g}{unit} with {ranking[1]}; " + _chance(
+            text += f", against {found[ranking[1]]:.4g}{unit} with {called(ranking[1])}; " + _chance(
                 pair, len(result.seeds)
             )
         told.append(f"{text}.")

@@ -9,7 +9,7 @@ from litho_data.reports.page import Page
 from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import Judgement, ScoreResult
-from litho_design.reports.advice import WORDS, headline, spread_sentence
+from litho_design.reports.advice import WORDS, called, headline, spread_sentence
 from litho_design.reports.parts import meanings, picture_grid, score_table
 
 
@@ -18,7 +18,7 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     page = Page(
         "Score of a printable layout",
         f"Designed through “{result.designed_with.name}”, printed by "
-        f"{', '.join(score.judge.name for score in result.scores)}.",
+        f"{', '.join(called(score.judge.name) for score in result.scores)}.",
         run=result,
         facts={"layout, SHA-256": result.layout_sha256, "seeds": ", ".join(map(str, result.seeds))},
         words=WORDS,
@@ -72,7 +72,7 @@ def _verdict(result: ScoreResult) -> str:
             "No judge is independent of the design: these scores only repeat the prediction of its own model."
         )
     told = [
-        f"{score.judge.name}: {headline(score.figures, score.uncertainty)}"
+        f"{called(score.judge.name)}: {headline(score.figures, score.uncertainty)}"
         f"{_against(score.figures, result.designed)}"
         for score in result.scores
         if score.independent

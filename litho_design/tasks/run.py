@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from litho_data.commands.progress import say
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
@@ -147,7 +147,7 @@ def _search(
             after = _seconds_after(task, parameters.cells(parameters.best_levels()))
             budget = budget.model_copy(update={"seconds_after": after})
         for line in (*task.notes, budget.sentence(search, done)):
-            print(line, file=sys.stderr)
+            say(line)
     state = search_layout(
         parameters, task.objective, search, folder=folder, fingerprint=fingerprint, part=task.part
     )

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from litho_data.commands.progress import say
+
 board = typer.Typer(help="Blind boards: can a loop name what the virtual fab hides?", no_args_is_help=True)
 
 
@@ -60,7 +62,7 @@ def judge(
         out,
         command_loop(loop) if loop else None,
         name=loop,
-        report=lambda message: typer.echo(message, err=True),
+        report=say,
     )
     for line in figure_lines(scoreboard):
         typer.echo(line)

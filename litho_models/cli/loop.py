@@ -7,6 +7,7 @@ import typer
 
 import litho_models
 from litho_data.commands.app import DaskOption, WorkersOption, argument, option
+from litho_data.commands.progress import say
 from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
@@ -84,7 +85,7 @@ def close_loop(
         seed=seed,
         workers=workers,
         dask=dask,
-        report=lambda message: typer.echo(message, err=True),
+        report=say,
     )
     typer.echo(said("verdict", result))
     for one in result.effects:
@@ -170,7 +171,7 @@ def next_print(
         seed=seed,
         steps=steps,
         layouts=layouts,
-        report=lambda message: typer.echo(message, err=True),
+        report=say,
     )
     if plan is None:
         typer.echo(f"nothing is open in {loop}: no print is needed")

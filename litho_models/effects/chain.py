@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,9 @@ from litho_models.effects.effect import Effect, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
 from litho_models.simulator import Simulator, Tile
 
+# What an effect turns with, where the microscope sees a print turned.
+Frame = Literal["scan", "print"]
+
 
 class EffectChain(nn.Module):
     """Layout effects, the base model, then height effects, in the order of the catalogue.
@@ -18,29 +22,19 @@ class EffectChain(nn.Module):
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
         effects: effect name to parameter values; parameters not named are off.
-        full_height_um: nominal height of the highest level, µm.
-        pitch_um: lateral sampling, µm.
-        scan_frame: height effects that act as the microscope's do, whatever the catalogue says: turned with
-            the scan. Those of the stage ``measurement`` do,
-        print_frame: but for these, which keep to the print.
+        frames: what an effect on the height turns with, where it is not its stage's: those of the stage
+            ``measurement`` go with the scan, all others with the print.
     """
 
     def __init__(
         self,
         base: nn.Module,
         effects: Mapping[str, Mapping[str, float]],
-        *,
-        full_height_um: float,
-        pitch_um: float,
-        scan_frame: Collection[str] = (),
-        print_frame: Collection[str] = (),
+        frames: Mapping[str, Frame] | None = None,
     ):
         super().__init__()
         self.base = base
-        self.full_height_um = full_height_um
-        self.pitch_um = pitch_um
-        self.scan_frame = frozenset(scan_frame)
-        self.print_frame = frozenset(print_frame)
+        self.frames = frames or {}
         self.names = tuple(in_forward_order(list(effects)))
         for name in self.names:
             effect = get_effect(name)
@@ -58,7 +52,12 @@ class EffectChain(nn.Module):
 
     def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
         """Height (b, 1, y, x), µm; without a context the field is a write field of its own."""
-        context = context or FieldContext(layout_um, self.pitch_um, self.full_height_um)
+        if context is None:
+            assert isinstance(self.base, Simulator)
+            geometry = self.base.config
+            context = FieldContext(
+                layout_um, geometry.pitch_um, geometry.full_height_um, geometry.level_height_um
+            )
         return self.after_base(self.base(self.before_base(layout_um, context)), context)
 
     def before_base(self, layout_um: Tensor, context: FieldContext) -> Tensor:
@@ -80,8 +79,8 @@ class EffectChain(nn.Module):
         for name in self.names:
             effect = get_effect(name)
             if effect.acts_on == acts_on:
-                turns = effect.stage == "measurement" or name in self.scan_frame
-                apply = effect.as_scanned if turns and name not in self.print_frame else effect.apply
+                usual = "scan" if effect.stage == "measurement" else "print"
+                apply = effect.as_scanned if self.frames.get(name, usual) == "scan" else effect.apply
                 field = apply(field, self._tensors(effect), context)
         return field
 

@@ -3,7 +3,6 @@
 An interrupted benchmark resumes, and an unchanged fit is never repeated.
 """
 
-import sys
 import time
 from collections.abc import Sequence
 from itertools import combinations
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.commands.progress import progress, say_estimate
+from litho_data.commands.progress import progress, say, say_estimate
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
@@ -95,7 +94,7 @@ def benchmark(
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     made = sum(not fold.locked for fold in plan)
     if split == "grouped" and made < folds:
-        print(f"{made} folds instead of {folds}: one for each scan that is not locked", file=sys.stderr)
+        say(f"{made} folds instead of {folds}: one for each scan that is not locked")
     if first_folds is not None:
         if not 1 <= first_folds <= made:
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")

@@ -125,7 +125,7 @@ def _errors(
     page.figure(
         plots.error_bars(scores, floor.mae_at(result.nuisance.policy), held_out_on_paper_data), caption
     )
-    page.table(tables.headline_table(scores, result.nuisance, floor), caption, csv_name)
+    page.table(tables.headline_table(scores, result.nuisance, floor), "The same in numbers.", csv_name)
 
 
 def _one_scan(

@@ -104,8 +104,7 @@ def load_frozen(
     if card.process_effects:
         from litho_models.effects.chain import EffectChain
 
-        full = simulator.config.full_height_um
-        model = EffectChain(simulator, card.process_effects, full_height_um=full, pitch_um=card.pitch_um)
+        model = EffectChain(simulator, card.process_effects)
     frozen = FrozenSimulator(model, card, file_sha256(path / CARD_FILE), extrapolate)
     return frozen.to(device)
 

@@ -1,9 +1,8 @@
-"""The model whose shortcomings are sought: the best of several small ones, or the one that is asked for."""
+"""The models whose shortcomings may be sought: several small ones, or the one that is asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,8 @@ from litho_data.store import PrintedScan
 from litho_models.fitting import TrainingConfig, fit_in_cache
 from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
-from litho_models.loop.fits import Study, fit_state
+from litho_models.loop.fits import Study
 from litho_models.loop.folded_base import train_folds
-from litho_models.loop.model import Twin
-from litho_models.loop.prepared import prepare_scans
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
@@ -27,60 +24,39 @@ AUTO = "auto"
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
-@dataclass(frozen=True)
-class Base:
-    """``model``: where fits begin, or taken as it is; ``others``: small models that lost against it."""
-
-    name: str
-    model: nn.Module
-    others: Mapping[str, nn.Module]
-
-
-def choose_base(
+def bases_for(
     base: str,
-    scans: Sequence[PrintedScan],
     study: Study,
     *,
-    steps: int | None,
+    steps: int | None = None,
     cache: Path,
     fields: Mapping[str, Any] = {},
-) -> Base:
-    """The base by what was asked for; a network is trained without each fold.
+) -> dict[str, nn.Module]:
+    """The models that may be corrected, by name: what was asked for; a network is trained without each fold.
 
     Args:
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
-        study: settings: folds, seed, workers, report.
+        study: scans, folds, seed, workers.
         steps: optimiser steps of a network, the recipe's if None; ``cache``: where its trainings are kept.
         fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
         InputError: no such base, one of another pitch, or settings of one that is not a small model.
     """
+    scans = [scan.stored for scan in study.scans]
     named = _built(base, scans[0], fields) if base in MODELS else None
     if fields and not (named and is_small(named)):
         raise InputError(f"settings of {base}", got=", ".join(fields), wanted="a small model's name as base")
     if base == AUTO:
-        return _best(scans, study)
+        return {name: _built(name, scans[0]) for name in _COMPETING}
     if named is None:
         return _frozen(base, scans[0].pitch_um)
     if is_small(named):
-        return Base(base, named, {})
+        return {base: named}
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     recipe = TrainingConfig.of_recipe("fast", base, seed=study.seed, **given)
     trainer = partial(_trained, base, recipe, cache)
-    return Base(base, train_folds(scans, study.fold_of, trainer, study.workers), {})
-
-
-def _best(scans: Sequence[PrintedScan], study: Study) -> Base:
-    built = {name: _built(name, scans[0]) for name in _COMPETING}
-    prepared = prepare_scans(scans)
-    plain = replace(study, scans=prepared)
-    errors = {}
-    for name, one in built.items():
-        study.report(f"trying {name} as the base")
-        errors[name] = fit_state(Twin.bare(one, prepared[0]), plain).mse_nm2
-    best = min(errors, key=lambda name: errors[name])
-    return Base(best, built.pop(best), built)
+    return {base: train_folds(scans, study.fold_of, trainer, study.workers)}
 
 
 def _built(name: str, scan: PrintedScan, fields: Mapping[str, Any] = {}) -> Simulator:
@@ -92,7 +68,7 @@ def _trained(base: str, settings: TrainingConfig, cache: Path, scans: Sequence[P
     return fit_in_cache(base, scans, settings, cache).model
 
 
-def _frozen(base: str, pitch_um: float) -> Base:
+def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
     from litho_models.frozen.card import ModelCard
     from litho_models.frozen.files import load_simulator
 
@@ -100,4 +76,4 @@ def _frozen(base: str, pitch_um: float) -> Base:
     card = ModelCard.read(folder)
     if abs(card.pitch_um - pitch_um) > 1e-9:
         raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=f"{pitch_um:g} µm")
-    return Base(card.name, load_simulator(folder, card), {})
+    return {card.name: load_simulator(folder, card)}

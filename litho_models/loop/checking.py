@@ -15,11 +15,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, fit_state, held_out_maps, without_terms
+from litho_models.loop.fits import State, Study, fit_state, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.screening import Screened, Screening
-from litho_models.loop.search import WORTH_FITTING, Cause
+from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
+from litho_models.loop.search import Cause
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -27,22 +27,6 @@ from litho_models.scan_terms.grouped import ALL, Block, Products
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
 # more.
 FORM_SHARE = 0.15
-
-
-@dataclass(frozen=True)
-class Checked:
-    """A cause, judged with everything else in place.
-
-    Attributes:
-        reshaped_share: what its change in other shapes would take beside it, of its gain.
-        reason: why its name does not stand; empty if it does.
-        corrects: the reason is that it may only correct the formula of another.
-    """
-
-    cause: Cause
-    reshaped_share: float
-    reason: str
-    corrects: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,28 +44,31 @@ class Check:
     laws: Sequence[Effect]
     left_nm2: float
     secants: Secants
-    study: Study
 
-    def of(self, cause: Cause) -> Checked:
-        """One of the causes."""
-        without = self.state.without(cause.name, self.study)
-        judgement = judge(without.freed_nm2, self.state.freed_nm2, self.study)
-        cause = replace(cause, judgement=judgement)
-        reshaped_nm2 = reshaped_gain(without, self.state, self.study)
-        share = reshaped_nm2 / max(judgement.gain_nm2, 1e-9)
-        if unneeded := judgement.reason(grouped=cause.by != ALL):
-            return Checked(cause, share, f"not needed beside the others: {unneeded}")
-        if larger := self._larger(cause, without):
-            return Checked(cause, share, f"may only correct the formula of {larger}", corrects=True)
-        exhausted = self.state.twin.exhausts(cause.name)
-        if exhausted and share > FORM_SHARE:
-            text = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
-            return Checked(cause, share, text)
+    @property
+    def study(self) -> Study:
+        """What the model is fitted to."""
+        return self.state.study
+
+    def of(self, cause: Cause) -> Cause:
+        """One of the causes, judged with everything else in place."""
+        without = self.state.without(cause.name)
+        cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
+        reshaped_nm2 = reshaped_gain(without, self.state)
+        share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
+        unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
+        larger = "" if unneeded else self._larger(cause, without)
+        if unneeded:
+            reason = f"not needed beside the others: {unneeded}"
+        elif larger:
+            reason = f"may only correct the formula of {larger}"
+        elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
+            reason = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
         # A small part of what is left is the little that any columns take of causes that are still missing.
-        if share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
+        elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
-            return Checked(cause, share, f"only resembles the cause: {taken}")
-        return Checked(cause, share, "")
+            reason = f"only resembles the cause: {taken}"
+        return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
         """A much larger law, or cause whose change in another shape takes half of what this one does.
@@ -94,49 +81,48 @@ class Check:
             if gain_nm2 < 0.1 * other.judgement.gain_nm2:
                 if get_effect(other.name).knowledge == "law":
                     return other.name
-                neither = without.without(other.name, self.study)
-                if reshaped_gain(neither, without, self.study) >= 0.5 * gain_nm2:
+                neither = without.without(other.name)
+                if reshaped_gain(neither, without) >= 0.5 * gain_nm2:
                     return other.name
         return ""
 
-    def beside_laws(self, checked: Checked) -> Checked:
+    def beside_laws(self, cause: Cause) -> Cause:
         """A cause that stands otherwise, held against laws: its name falls if short ones do better.
 
         Two laws at most, with no more numbers than the cause has.
         """
-        name = checked.cause.name
-        numbers = sum(slot.effect == name for slot in self.state.twin.slots)
-        state = self.state.without(name, self.study)
+        numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
+        state = self.state.without(cause.name)
         laws: list[str] = []
         while len(laws) < 2 and (law := self._best_law(state, numbers)):
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
             numbers -= law.numbers
             laws.append(law.name)
             if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
-                return replace(checked, reason=f"short laws do better in its place: {', '.join(laws)}")
-        return checked
+                return replace(cause, reason=f"short laws do better in its place: {', '.join(laws)}")
+        return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
         """The law that promises most, if that is a fair part of what this model lacks beside the cause."""
         laws = [law for law in self.laws if law.name not in state.twin.names]
+        least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
             one
-            for one in Screening(state, self.study, laws, self.secants).candidates
-            if one.allowed
-            and one.numbers <= numbers
-            and one.gain_nm2 > WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
+            for own in Screening(state, laws, self.secants).candidates.values()
+            for one in own.values()
+            if one.allowed and one.numbers <= numbers and one.gain_nm2 > least
         )
-        return next(promising, None)
+        return max(promising, key=lambda one: one.gain_nm2, default=None)
 
 
-def reshaped_gain(without: State, state: State, study: Study) -> float:
+def reshaped_gain(without: State, state: State) -> float:
     """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
 
     Args:
         without, state: the model without and with the cause.
     """
-    grams = []
-    before, after = (held_out_maps(one.per_fold, study, study.windows) for one in (without, state))
+    grams, study = [], state.study
+    before, after = (one.maps_um(study.windows) for one in (without, state))
     for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
@@ -154,10 +140,12 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
 
-    # Widths in pixels, which are small beside what the process resolves, on films of nanometres too.
-    near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
+    def blurred(field: np.ndarray, sigma_um: float) -> np.ndarray:
+        return gaussian_filter(field, sigma_um / pitch)
+
+    near, far = blurred(layout, 0.6), blurred(layout, 2.0)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
-    soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]
+    soft = [blurred(change, sigma_um) for sigma_um in (0.2, 0.6, 1.6)]
     y, x = (np.linspace(-1, 1, size) for size in change.shape)
     place = y[:, None], x, y[:, None] ** 2 + x**2
     factors = (1.0, relative, relative**2, np.abs(change), near, far, near - layout, *place)

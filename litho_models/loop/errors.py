@@ -7,20 +7,21 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from torch import nn
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
-from litho_models.loop.closing import Closed, Fit, fit_with_measurement
-from litho_models.loop.fits import State, fit_state, held_out_maps
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import State, fit_state
 from litho_models.loop.judging import judge
+from litho_models.loop.measured import Fit, fit_with_measurement
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
-from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
+from litho_models.scan_terms import Blocks, Policy
 from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.shapes import edges_of_scan
 from litho_models.scoring.statistics import interval
@@ -42,15 +43,17 @@ def error_rows(
         numbers: fitted numbers of printer and measurement; ``terms``: model, measurement and held_out of
             ``ErrorRow``.
     """
-    rows = []
+    rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
-    for policy in ("none",) if films else REPORTED:
-        fits = [
-            cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
-            for scan, own in zip(scans, maps_um, strict=True)
-        ]
+    freed = freed_by_policy(scans, maps_um, Blocks(seed=seed), ("none",) if films else REPORTED)
+    for policy, fits in freed.items():
         mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
         mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
+        edges = [
+            edges_of_scan(scan, own, fit.residual_um).mean_nm or 0.0
+            for scan, own, fit in zip(scans, maps_um, fits, strict=True)
+            if films
+        ]
         rows.append(
             ErrorRow(
                 **terms,
@@ -61,12 +64,8 @@ def error_rows(
                 mae_nm=float(np.mean(mae)),
                 mae_ci95_nm=interval(mae),
                 rmse_nm=float(np.sqrt(np.mean(mse))),
-                by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
-                edge_by_scan_nm={
-                    scan.id: edges_of_scan(scan, own, fit.residual_um).mean_nm or 0.0
-                    for scan, own, fit in zip(scans, maps_um, fits, strict=True)
-                    if films
-                },
+                by_scan_nm=dict(zip(ids, mae, strict=True)),
+                edge_by_scan_nm=dict(zip(ids, edges, strict=films)),
             )
         )
     return rows
@@ -80,32 +79,30 @@ class HeldOut:
     """
 
     def __init__(self, closed: Closed):
-        self.closed, self.study = closed, closed.study
-        self.scans = [one.stored for one in closed.original]
+        self.closed, self.study = closed, closed.given
+        self.scans = [one.stored for one in self.study.scans]
         self._by_fold = cache(self._without_folds)
+        self.fit = cache(lambda state: fit_with_measurement(state.twin, self.study.scans, self.study.seed))
 
     @property
     def ends(self) -> dict[Stage, State]:
         """Base and corrected model."""
         return {"base": self.closed.base, "all": self.closed.final}
 
-    @property
-    def stages(self) -> dict[Stage, State]:
-        """The same, and the model with the causes alone between them if it is neither."""
-        causes = self.closed.chosen.named.state
-        between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
-        return {"base": self.closed.base, **between, **self.ends}
-
     def errors(self) -> list[ErrorRow]:
-        """Of all models, scans predicted without their fold; of first and last also without their print."""
-        plain = self.closed.plain
+        """Of all models, scans predicted without their fold; of first and last also without their print.
+
+        Between them stands the model with the causes alone, if it is neither.
+        """
+        plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
-        maps = held_out_maps(plain.per_fold, self.study, self.closed.original)
+        maps = plain.maps_um(self.study.scans)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
-        if not self.closed.study.of_films:
+        if not self.study.of_films:
             # A smooth background has five numbers.
             rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
-        for name, state in self.stages.items():
+        between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
+        for name, state in {"base": self.closed.base, **between, **self.ends}.items():
             self.study.report("scoring the base" if name == "base" else f"scoring {name}")
             rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
@@ -115,14 +112,6 @@ class HeldOut:
                 starts = dict.fromkeys(sorted(set(prints)), state.twin)
                 rows += self._rows(*self._without_parts(starts, prints), name, held_out="prints")
         return rows
-
-    def of_others(self, scans: Sequence[PrintedScan]) -> list[tuple[Stage, tuple[int, int], Maps]]:
-        """Numbers of base and corrected model, fitted to all scans that took part; maps of these others."""
-        prepared, found = prepared_among(scans, self.closed.original), []
-        for name, state in self.ends.items():
-            fit = fit_with_measurement(state.twin, self.closed.original, self.study.seed)
-            found.append((name, fit.numbers, fit.expected_um(prepared)))
-        return found
 
     def maps_um(self, state: State) -> Maps:
         """The maps (y, x) that the scans should show, print and measurement learned without their fold."""
@@ -142,7 +131,7 @@ class HeldOut:
         whole_nm = error_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
-            found[name] = error_nm(model.without(name, self.study)) - whole_nm
+            found[name] = error_nm(model.without(name)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -158,17 +147,17 @@ class HeldOut:
             for scan, before, after in zip(self.scans, *maps, strict=True)
         ]
 
-    def survives_on(self, others: Mapping[str, nn.Module]) -> dict[str, list[str]]:
+    def survives_on(self) -> dict[str, list[str]]:
         """For each cause and law, the other bases on which it is confirmed too, all others in place."""
-        final, study = self.closed.final.twin, self.study
+        final, study = self.closed.final.twin, self.closed.study
         found: dict[str, list[str]] = {name: [] for name in final.names}
-        for base_name, base in others.items() if found else ():
-            self.study.report(f"trying what was found on {base_name}")
-            bare = fit_state(Twin.bare(base, study.scans[0]), study)
-            full = fit_state(final.over(bare.twin.placed().base, study.scans[0]), study)
-            for name, by in final.by.items():
-                without = full.without(name, study)
-                if judge(without.freed_nm2, full.freed_nm2, study).passed(grouped=by != ALL):
+        for base_name, base in self.closed.others.items() if found else ():
+            study.report(f"trying what was found on {base_name}")
+            bare = fit_state(Twin.bare(base), study)
+            full = fit_state(final.over(bare.twin.fitted_base), study)
+            for name, one in final.effects.items():
+                judgement = judge(full.without(name).freed_nm2, full.freed_nm2, study)
+                if judgement.passed(grouped=one.by != ALL):
                     found[name].append(base_name)
         return found
 
@@ -177,8 +166,7 @@ class HeldOut:
         return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
 
     def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
-        fold_of = self.study.fold_of.tolist()
-        return self._without_parts(dict(enumerate(state.per_fold)), fold_of, refit)
+        return self._without_parts(dict(enumerate(state.per_fold)), self.study.fold_of.tolist(), refit)
 
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
@@ -188,24 +176,22 @@ class HeldOut:
         Args:
             starts: part to where its fit begins.
         """
-        original, jobs = self.closed.original, []
+        scans, jobs = self.study.scans, []
         for part, twin in starts.items():
-            rest = [scan for scan, own in zip(original, part_of, strict=True) if own != part]
+            rest = [scan for scan, own in zip(scans, part_of, strict=True) if own != part]
             jobs.append((part, twin, rest, self.study.seed, refit))
         done = run_jobs(_fit_part, jobs, self.study.workers, name=lambda job: f"part {job[0]}")
         fits = {job[0]: fit for job, fit in done}
-        maps = [fits[part].expected_um([scan])[0] for scan, part in zip(original, part_of, strict=True)]
+        maps = [fits[part].expected_um(scan) for scan, part in zip(scans, part_of, strict=True)]
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, maps: Maps) -> Maps:
         """The maps with the smooth background of the training scans: the published protocol."""
-        found, fold_of = list(maps), self.study.fold_of
-        for fold, twin in enumerate(self.closed.plain.per_fold):
-            placed, own = twin.placed(), np.flatnonzero(fold_of != fold).tolist()
-            learned = learn_background(
-                [self.scans[i] for i in own], [placed.height(self.closed.original[i]) for i in own]
-            )
-            for i in np.flatnonzero(fold_of == fold).tolist():
+        found = list(maps)
+        for twin, (rest, own) in zip(self.closed.plain.per_fold, self.study.folds, strict=True):
+            heights = [twin.height(self.study.scans[i]) for i in rest]
+            learned = learn_background([self.scans[i] for i in rest], heights)
+            for i in own:
                 found[i] = Prediction.beside(learned, maps[i]).map_um
         return found
 
@@ -221,14 +207,17 @@ def errors_of_others(
     seed: int,
 ) -> list[ErrorRow]:
     """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
-    maps: dict[Stage, dict[str, np.ndarray]] = {}
-    numbers: dict[Stage, tuple[int, int]] = {}
+    maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
+    numbers = dict.fromkeys(maps, (0, 0))
     for models, out in found:
-        for stage, count, own in models.of_others(out):
-            maps.setdefault(stage, {}).update(zip([scan.id for scan in out], own, strict=True))
-            numbers[stage] = max(count, numbers.get(stage, count))
+        prepared = prepared_among(out, models.study.scans)
+        for stage, state in models.ends.items():
+            fit = models.fit(state)
+            maps[stage] |= {scan.id: fit.expected_um(scan) for scan in prepared}
+            numbers[stage] = max(fit.numbers, numbers[stage])
+    terms = {"measurement": "shared", "held_out": held_out}
     rows = []
     for stage, known in maps.items():
-        terms = {"model": stage, "measurement": "shared", "held_out": held_out}
-        rows += error_rows(scans, [known[scan.id] for scan in scans], numbers[stage], seed, **terms)
+        own = [known[scan.id] for scan in scans]
+        rows += error_rows(scans, own, numbers[stage], seed, model=stage, **terms)
     return rows

@@ -13,6 +13,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import HERE, Workers
+from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
     Linearised,
@@ -23,10 +24,11 @@ from litho_models.fitting.least_squares import (
     solve_damped,
     with_residuals,
 )
-from litho_models.loop.model import Placed, Twin
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
+from litho_models.splits.folds import grouped_folds
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
@@ -55,13 +57,34 @@ class Study:
     workers: Workers = HERE
     report: Callable[[str], None] = _silent
 
+    @classmethod
+    def dealt(
+        cls,
+        scans: Sequence[PrintedScan],
+        folds: int,
+        seed: int = 0,
+        workers: Workers = HERE,
+        report: Callable[[str], None] = _silent,
+    ) -> Study:
+        """Scans of a store dealt into folds, one for each scan at most."""
+        ids = [scan.id for scan in scans]
+        lists = grouped_folds(ids, min(folds, len(ids)), seed)
+        fold = {one: number for number, members in enumerate(lists) for one in members}
+        return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
+
+    def of_others(self, scans: Sequence[PrintedScan]) -> Study:
+        """Other scans dealt alike, without a word."""
+        return Study.dealt(scans, len(self.folds), self.seed, self.workers)
+
     def __getstate__(self) -> dict[str, object]:
         """In another process a study has no workers of its own, and nobody to tell."""
         return {**self.__dict__, "workers": HERE, "report": _silent}
 
     @property
-    def folds(self) -> range:
-        return range(int(self.fold_of.max()) + 1)
+    def folds(self) -> list[tuple[list[int], list[int]]]:
+        """Of each fold the numbers of the scans that are not in it, and of those that are."""
+        own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
+        return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
     @property
     def windows(self) -> list[PreparedScan]:
@@ -87,7 +110,7 @@ class Study:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A fitted twin.
+    """A twin fitted to the scans of a study.
 
     Attributes:
         twin: at the numbers fitted to all scans; ``per_fold``: the same, each fitted without its own scans.
@@ -96,6 +119,7 @@ class State:
         freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
     """
 
+    study: Study
     twin: Twin
     per_fold: list[Twin]
     linear: list[Linearised]
@@ -108,11 +132,20 @@ class State:
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
 
-    def without(self, name: str, study: Study) -> State:
+    def __getstate__(self) -> dict[str, object]:
+        """It comes from another process without its scans."""
+        return {**self.__dict__, "study": None}
+
+    def without(self, name: str) -> State:
         """The model without one of its effects, fitted again from here."""
         if name not in self._without:
-            self._without[name] = fit_state(self.twin.without(name), study, from_here=True)
+            self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
         return self._without[name]
+
+    def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+        """Predicted prints (y, x) of the scans or their windows, each by the twin that has not seen it."""
+        folds = zip(self.study.fold_of, scans, strict=True)
+        return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
 
 class TwinProblem:
@@ -125,16 +158,16 @@ class TwinProblem:
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         """Residuals, derivatives and free terms of all windows."""
         here = self._twin.at(vector)
-        placed, steps = here.placed(), here.steps()
-        moved = [here.at(vector + one).placed() for one in np.diag(steps)]
-        return [self._of_window(placed, moved, steps, window) for window in self._windows]
+        steps = here.steps()
+        moved = [here.at(vector + one) for one in np.diag(steps)]
+        return [self._of_window(here, moved, steps, window) for window in self._windows]
 
     def _of_window(
-        self, placed: Placed, moved: Sequence[Placed], steps: np.ndarray, window: PreparedScan
+        self, twin: Twin, moved: Sequence[Twin], steps: np.ndarray, window: PreparedScan
     ) -> Linearised:
-        twin, layout = placed.twin, placed.exposed(window)
-        base = placed.base_height(layout, window)
-        prediction = placed.height(window, base_um=base)
+        layout = twin.exposed(window)
+        base = twin.base_height(layout, window)
+        prediction = twin.height(window, base_um=base)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
@@ -149,8 +182,8 @@ class TwinProblem:
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all windows, µm."""
-        placed = self._twin.at(vector).placed()
-        return [window.height - window.at_sample(placed.height(window)) for window in self._windows]
+        twin = self._twin.at(vector)
+        return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effects stay within their range, the base does not go too far at once."""
@@ -170,24 +203,16 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
     per_fold = []
-    for fold in study.folds:
-        own = np.flatnonzero(study.fold_of != fold).tolist()
+    for fold, (own, _) in enumerate(study.folds):
         per_fold.append(_without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own]))
-    maps = held_out_maps(per_fold, study, windows)
+    maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
     freed = [
         without_terms(left[:, None], window, own)
         for left, window, own in zip(held_out, windows, maps, strict=True)
     ]
-    return State(
-        common, per_fold, linear, held_out, np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
-    )
-
-
-def held_out_maps(per_fold: Sequence[Twin], study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-    """Predicted prints (y, x), µm, each by the twin that has not seen the scan."""
-    placed = [twin.placed() for twin in per_fold]
-    return [placed[fold].height(scan) for fold, scan in zip(study.fold_of, scans, strict=True)]
+    freed_nm2 = np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
+    return State(study, common, per_fold, linear, held_out, freed_nm2)
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
@@ -196,7 +221,7 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     The best base without an effect is no good place to look for one beside it: what the base took of the
     effect keeps it there, on the wrong side of a hill.
     """
-    unfitted = twin.with_base_unfitted()
+    unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
         return twin.vector
     # The way to the neighbourhood of the optimum is walked on every third scan.

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from litho_models.effects import Parameter, get_effect
-from litho_models.effects.chain import EffectChain
+from litho_models.effects.chain import EffectChain, Frame
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
@@ -19,7 +20,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
-Values = dict[str, dict[str, float]]
+Values = Mapping[str, Mapping[str, float]]
 # How near a fitted number is to a bound that it stands on, of its size.
 _AT_BOUND = 1e-6
 
@@ -39,96 +40,101 @@ class Slot:
 
 
 @dataclass(frozen=True)
+class Added:
+    """An effect in a model.
+
+    ``by``: the grouping in which its amplitudes differ, ``all`` for one strength; ``values``: of all its
+    parameters by label, ``""`` for all scans.
+    """
+
+    by: str
+    values: Values
+
+    def of(self, label: str | None) -> dict[str, float]:
+        """The parameters of a group; of one that was never fitted the mean of those that were."""
+        if label is not None and label in self.values:
+            return dict(self.values[label])
+        first = next(iter(self.values.values()))
+        return {key: float(np.mean([own[key] for own in self.values.values()])) for key in first}
+
+
+@dataclass(frozen=True)
 class Twin:
     """Base and effects with their numbers; a fit moves ``vector`` and leaves the rest.
 
     Attributes:
         base: the model of the printer; its own numbers are refitted if they are few.
-        by: effect to the grouping in which its strength differs, ``all`` for one strength.
-        choices: effect to the values of parameters that are never fitted (a direction).
-        slots: the fitted numbers of the effects, in the order of ``vector``, after those of the base.
-        vector: all fitted numbers.
-        full_height_um, pitch_um: of the layouts.
-        scan_frame, print_frame: effects that turn with the scan, or keep to the print, whatever the catalogue
-            says; see ``EffectChain``.
+        numbers: those of the base.
+        effects: in the order in which they came.
+        frames: what an effect turns with, where it is not what the catalogue says; see ``EffectChain``.
     """
 
     base: nn.Module
-    by: Mapping[str, str]
-    choices: Mapping[str, Mapping[str, float]]
-    slots: tuple[Slot, ...]
-    vector: np.ndarray
-    full_height_um: float
-    pitch_um: float
-    scan_frame: frozenset[str] = frozenset()
-    print_frame: frozenset[str] = frozenset()
+    numbers: np.ndarray
+    effects: Mapping[str, Added] = field(default_factory=dict)
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    _chains: dict[tuple[str, ...], EffectChain] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
-    def bare(cls, base: nn.Module, scan: PreparedScan) -> Twin:
-        """The base alone, for scans like this one."""
-        return cls.of_base(base, scan.context.full_height_um, scan.context.pitch_um)
-
-    @classmethod
-    def of_base(cls, base: nn.Module, full_height_um: float, pitch_um: float) -> Twin:
-        """The base alone, for layouts of this height and pitch."""
-        return cls(base, {}, {}, (), _numbers(base), full_height_um, pitch_um)
+    def bare(cls, base: nn.Module) -> Twin:
+        """The base alone."""
+        return cls(base, _numbers(base))
 
     @property
     def own(self) -> int:
         """How many of the numbers are the base's."""
-        return len(self.vector) - len(self.slots)
+        return len(self.numbers)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The effects, as they act."""
-        return tuple(self.by)
+        return tuple(in_forward_order(list(self.effects)))
+
+    @cached_property
+    def slots(self) -> list[Slot]:
+        """The fitted numbers of the effects, in the order of ``vector``, after those of the base."""
+        return [
+            Slot(name, key, label)
+            for name, one in self.effects.items()
+            for key, facts in get_effect(name).parameters.items()
+            if facts.kind != "choice"
+            for label in (sorted(one.values) if facts.kind == "amplitude" and one.by != ALL else [None])
+        ]
+
+    @cached_property
+    def vector(self) -> np.ndarray:
+        """All fitted numbers."""
+        of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
+        return np.concatenate([self.numbers, of_slots])
 
     def at(self, vector: np.ndarray) -> Twin:
         """The same with other numbers."""
-        return replace(self, vector=vector)
+        values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
+        for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
+            for label, own in values[slot.effect].items():
+                if slot.label in (None, label):
+                    own[slot.parameter] = number
+        effects = {name: replace(one, values=values[name]) for name, one in self.effects.items()}
+        return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
         """The same over a base that has not seen the fold, where one was trained without each."""
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
-    def with_effect(self, name: str, by: str, values: Mapping[str, Mapping[str, float]]) -> Twin:
+    def with_effect(self, name: str, by: str, values: Values) -> Twin:
         """One effect more, with starting values by label (``""`` for all scans)."""
-        effect = get_effect(name)
-        first = next(iter(values.values()))
-        fitted = {key: facts for key, facts in effect.parameters.items() if facts.kind != "choice"}
-        slots = [
-            Slot(name, key, label)
-            for key, facts in fitted.items()
-            for label in (sorted(values) if facts.kind == "amplitude" and by != ALL else [None])
-        ]
-        numbers = [values.get(slot.label or "", first)[slot.parameter] for slot in slots]
-        groupings = {**self.by, name: by}
-        return replace(
-            self,
-            by={one: groupings[one] for one in in_forward_order(list(groupings))},
-            choices={
-                **self.choices,
-                name: {key: first[key] for key in effect.parameters if key not in fitted},
-            },
-            slots=(*self.slots, *slots),
-            vector=np.concatenate([self.vector, numbers]),
-        )
+        return replace(self, effects={**self.effects, name: Added(by, values)})
 
     def only(self, names: Collection[str]) -> Twin:
         """The same with no other effects than these."""
-        kept = [i for i, slot in enumerate(self.slots) if slot.effect in names]
-        return replace(
-            self,
-            by={one: by for one, by in self.by.items() if one in names},
-            choices={one: own for one, own in self.choices.items() if one in names},
-            slots=tuple(self.slots[i] for i in kept),
-            vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
-        )
+        return replace(self, effects={name: one for name, one in self.effects.items() if name in names})
 
     def without(self, name: str) -> Twin:
         """The same without one of its effects."""
-        return self.only({*self.by} - {name})
+        return self.only({*self.effects} - {name})
 
     def alone(self) -> Twin:
         """The same without any effect."""
@@ -136,64 +142,90 @@ class Twin:
 
     def ungrouped(self) -> Twin:
         """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
-        twin = self.alone()
-        for name, values in self.values({}).items():
-            twin = twin.with_effect(name, ALL, {"": values})
-        return twin
+        effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
+        return replace(self, effects=effects)
 
-    def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
+    def over(self, base: nn.Module) -> Twin:
         """The same effects over another base."""
-        vector = np.concatenate([Twin.bare(base, scan).vector, self.vector[self.own :]])
-        return replace(self, base=base, vector=vector)
+        return replace(self, base=base, numbers=_numbers(base))
 
-    def with_base_unfitted(self) -> np.ndarray:
-        """The numbers with the base's as they are before any fit."""
+    def with_base_unfitted(self) -> Twin:
+        """The same with the base as it is before any fit."""
         if not (self.own and isinstance(self.base, Simulator)):
-            return self.vector
-        return np.concatenate([_numbers(type(self.base)(self.base.config)), self.vector[self.own :]])
+            return self
+        return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
-    def values(self, label_in: Mapping[str, str]) -> Values:
-        """Parameter values of all effects for the scans with these labels, by grouping.
-
-        An amplitude of a label that was never fitted is the mean of those that were.
-        """
-        found: Values = {name: dict(self.choices[name]) for name in self.by}
-        alike: dict[tuple[str, str], dict[str | None, float]] = {}
-        for slot, number in zip(self.slots, self.vector[self.own :], strict=True):
-            alike.setdefault((slot.effect, slot.parameter), {})[slot.label] = float(number)
-        for (name, parameter), known in alike.items():
-            mean = float(np.mean(list(known.values())))
-            found[name][parameter] = known.get(label_in.get(self.by[name], ""), mean)
-        return found
+    def values(self, label_in: Mapping[str, str]) -> dict[str, dict[str, float]]:
+        """Parameter values of all effects, as they act, for the scans with these labels, by grouping."""
+        return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
         """The scan's label in every grouping in use."""
-        return {by: label_of(scan.stored, by) for by in dict.fromkeys(self.by.values()) if by != ALL}
+        return {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
         """Whether a number is one of the scan's own group, or of all scans."""
-        return slot.label is None or slot.label == label_of(scan.stored, self.by[slot.effect])
+        return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
         """The same with nothing but these scans behind it.
 
         A strength of a group that none of them is in becomes the mean of the other groups' strengths.
         """
-        seen = [any(self.is_of(slot, scan) for scan in scans) for slot in self.slots]
-        vector = self.vector.copy()
-        for at, slot in enumerate(self.slots):
-            if not seen[at]:
-                alike = [
-                    self.vector[self.own + other]
-                    for other, one in enumerate(self.slots)
-                    if seen[other] and (one.effect, one.parameter) == (slot.effect, slot.parameter)
-                ]
-                vector[self.own + at] = np.mean(alike) if alike else slot.facts.null
-        return self.at(vector)
+        effects = {}
+        for name, one in self.effects.items():
+            seen = {label_of(scan.stored, one.by) for scan in scans}
+            known = {label: own for label, own in one.values.items() if label in seen}
+            known = known or {"": get_effect(name).off_values()}
+            effects[name] = replace(
+                one, values={label: Added(one.by, known).of(label) for label in one.values}
+            )
+        return replace(self, effects=effects)
 
-    def placed(self) -> Placed:
-        """The model at its numbers, ready to predict; the twin keeps a base of its own."""
-        return Placed(self)
+    @cached_property
+    def fitted_base(self) -> nn.Module:
+        """The base at its numbers: a copy of its own, where it has any."""
+        if not self.own:
+            return self.base
+        base, at = copy.deepcopy(self.base), 0
+        for parameter in _parameters(base):
+            values = self.vector[at : at + parameter.numel()]
+            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
+            at += parameter.numel()
+        return base
+
+    def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
+        """The chain of effects as it is for one scan, or with mean strengths; ``extra``: tried on top."""
+        labels = {} if scan is None else self.labels(scan)
+        key = tuple(labels.values())
+        if extra or key not in self._chains:
+            values = {**self.values(labels), **(extra or {})}
+            chain = EffectChain(self.fitted_base, values, frames=self.frames)
+            if extra:
+                return chain
+            self._chains[key] = chain
+        return self._chains[key]
+
+    @torch.no_grad()
+    def exposed(self, scan: PreparedScan) -> Tensor:
+        """The layout (1, 1, y, x), µm, with the effects that act on it."""
+        return self.chain(scan).before_base(scan.context.layout_um, scan.context)
+
+    @torch.no_grad()
+    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
+        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
+        base = self.fitted_base
+        return (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
+
+    @torch.no_grad()
+    def height(
+        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
+    ) -> np.ndarray:
+        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
+        chain = self.chain(scan, extra)
+        if base_um is None:
+            base_um = self.base_height(chain.before_base(scan.context.layout_um, scan.context), scan)
+        return chain.after_base(base_um, scan.context)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
         """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
@@ -230,8 +262,8 @@ class Twin:
 
     def at_bounds(self) -> dict[str, float]:
         """Fitted values of base and effects that stand on a bound of their range, and that bound."""
-        placed = self.placed().base
-        found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
+        base = self.fitted_base
+        found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
@@ -247,60 +279,6 @@ class Twin:
             for bound in (slot.facts.lower, slot.facts.upper)
             if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound))
         ]
-
-
-class Placed:
-    """A twin at its numbers; the base is a copy of its own."""
-
-    def __init__(self, twin: Twin):
-        self.twin = twin
-        self.base = copy.deepcopy(twin.base) if twin.own else twin.base
-        at = 0
-        for parameter in _parameters(self.base) if twin.own else ():
-            values = twin.vector[at : at + parameter.numel()]
-            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
-            at += parameter.numel()
-        self._chains: dict[tuple[tuple[str, str], ...], EffectChain] = {}
-
-    def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
-        """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
-        labels = tuple(self.twin.labels(scan).items())
-        if extra is not None:
-            return self.of_labels(labels, extra)
-        if labels not in self._chains:
-            self._chains[labels] = self.of_labels(labels)
-        return self._chains[labels]
-
-    def of_labels(self, labels: tuple[tuple[str, str], ...] = (), extra: Values | None = None) -> EffectChain:
-        """The chain for scans with these labels, by grouping; without any it has the mean strengths."""
-        return EffectChain(
-            self.base,
-            {**self.twin.values(dict(labels)), **(extra or {})},
-            full_height_um=self.twin.full_height_um,
-            pitch_um=self.twin.pitch_um,
-            scan_frame=self.twin.scan_frame,
-            print_frame=self.twin.print_frame,
-        )
-
-    @torch.no_grad()
-    def exposed(self, scan: PreparedScan, extra: Values | None = None) -> Tensor:
-        """The layout (1, 1, y, x), µm, with the effects that act on it."""
-        return self.chain(scan, extra).before_base(scan.context.layout_um, scan.context)
-
-    @torch.no_grad()
-    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
-        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
-        base = self.base.of_scan(scan.id) if isinstance(self.base, FoldedBase) else self.base
-        return base(exposed_um)
-
-    @torch.no_grad()
-    def height(
-        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
-    ) -> np.ndarray:
-        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
-        if base_um is None:
-            base_um = self.base_height(self.exposed(scan, extra), scan)
-        return self.chain(scan, extra).after_base(base_um, scan.context)[0, 0].numpy()
 
 
 def is_refitted(base: nn.Module) -> bool:

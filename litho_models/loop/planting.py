@@ -47,16 +47,16 @@ def plant(
     """
     amplitude = effect.amplitudes[0]
     values = {effect.name: {**effect.off_values(), amplitude: amount}}
-    placed = closed.base.twin.placed()
+    twin = closed.base.twin
     changed, squares = [], []
-    for scan in closed.original:
-        here = placed.height(scan)
-        added = placed.height(scan, values) - here
+    for scan in closed.given.scans:
+        here = twin.height(scan)
+        added = twin.height(scan, values) - here
         changed.append(replace(scan.stored, height_um=scan.stored.height_um + added.astype(np.float32)))
         freed = without_terms(scan.at_sample(added)[:, None], scan, here)
         squares.append(float(np.mean(freed**2)))
     again = close_again(changed)
-    cause = next((one for one in again.causes if effect.name in (one.name, *one.alike)), None)
+    cause = next((one for one in again.named.causes if effect.name in (one.name, *one.alike)), None)
     named = [] if cause is None else [cause.name, *cause.alike]
     found = again.final.twin.values({}).get(effect.name, {}).get(amplitude)
     return Planted(

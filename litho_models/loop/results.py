@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import t
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.least_squares import Linearised, eliminated, eliminated_sum
@@ -48,18 +49,20 @@ def record(
         closed: what was found; ``errors``: of ``error_rows``; ``single_scans``: what those add.
         left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
     """
-    study, scans = closed.study, closed.study.scans
-    effects = [_found(closed, one, left_out_nm, survives_on) for one in closed.found]
-    by_stage = {row.model: row for row in errors if row.is_headline}
-    before, after = by_stage["base"], by_stage["all"]
-    was_nm, is_nm = before.leading_by_scan_nm, after.leading_by_scan_nm
-    gains = [was_nm[scan.id] - is_nm[scan.id] for scan in scans]
-    prints = [scan.stored.print_id for scan in scans]
+    study, final = closed.study, closed.final.twin
+    effects = [_found(closed, one, left_out_nm[one.name], survives_on[one.name]) for one in closed.found]
+    before, after = (
+        next(row.leading_by_scan_nm for row in errors if row.is_headline and row.model == model)
+        for model in ("base", "all")
+    )
+    gains = [before[scan.id] - after[scan.id] for scan in study.scans]
+    prints = [scan.stored.print_id for scan in study.scans]
     return CloseLoop(
         **given,
+        base_model=closed.base_name,
         base_values=_values(closed.base.twin),
-        corrected_values=_values(closed.final.twin),
-        at_bounds=closed.final.twin.at_bounds(),
+        corrected_values=_values(final),
+        at_bounds=final.at_bounds(),
         groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
         errors=errors,
         gain_nm=float(np.mean(gains)),
@@ -90,35 +93,28 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
         return "described"
     if len(closed.study.scans) < FEWEST_SCANS:
         return "too-few-scans"
-    left = [*closed.rests.values()][-1].matters or closed.chosen.named.refused
+    left = [*closed.rests.values()][-1].matters or closed.named.refused
     return "unexplained" if left else "nothing-missing"
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """The base's numbers by their physical names; empty for a base that is not fitted."""
-    base = twin.placed().base
+    """The base's numbers by their physical names, as it holds them; empty for a base that is not fitted."""
+    base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
         return {}
-    known = getattr(base, "values", None)
-    if known is not None:
-        return {name: float(value.detach()) for name, value in known.items()}
-    return {
-        f"{name}{f' {i}' if p.numel() > 1 else ''}": float(value)
-        for name, p in base.named_parameters()
-        for i, value in enumerate(p.detach().reshape(-1))
-    }
+    found = {}
+    for name, parameter in base.named_parameters():
+        if name in base.ranges:
+            found[base.ranges[name].name] = float(base.ranges[name].value(parameter.detach()))
+            continue
+        for i, value in enumerate(parameter.detach().reshape(-1)):
+            found[f"{name} {i}" if parameter.numel() > 1 else name] = float(value)
+    return found
 
 
-def _found(
-    closed: Closed,
-    cause: Cause,
-    left_out_nm: Mapping[str, float],
-    survives_on: Mapping[str, list[str]],
-) -> FoundEffect:
-    effect = get_effect(cause.name)
+def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[str]) -> FoundEffect:
+    effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
-    verdict = verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained")
-    reshaped = next((c.reshaped_share for c in closed.chosen.checked if c.cause.name == cause.name), None)
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
     return FoundEffect(
         name=cause.name,
@@ -126,42 +122,37 @@ def _found(
         knowledge=effect.knowledge,
         role=effect.role if len(roles) == 1 else "undetermined",
         stage=effect.stage,
-        verdict=verdict,
+        verdict=verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained"),
         by=cause.by,
-        strengths=_strengths(closed, cause),
+        strengths=_strengths(closed, cause.name),
         confusable_with=list(cause.alike),
         separating_experiment=separating([cause.name, *cause.alike]),
-        gain_nm2=cause.judgement.gain_nm2,
-        before_nm2=cause.judgement.before_nm2,
-        scans_improved=cause.judgement.improved,
-        p_confirm=cause.judgement.p,
+        gain_nm2=judgement.gain_nm2,
+        before_nm2=judgement.before_nm2,
+        scans_improved=judgement.improved,
+        p_confirm=judgement.p,
         family_p=cause.family_p,
         group_p=cause.group_p,
-        reshaped_share=reshaped,
-        left_out_nm=left_out_nm.get(cause.name),
-        survives_on=survives_on.get(cause.name, []),
+        reshaped_share=cause.reshaped_share,
+        left_out_nm=left_out_nm,
+        survives_on=survives_on,
     )
 
 
-def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
+def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """Numbers of an effect with intervals from what each print (or scan) asks for."""
-    from scipy.stats import t
-
-    facts, found = get_effect(cause.name).parameters, dict[str, list[Strength]]()
-
-    def add(parameter: str, label: str, value: float, half: float = 0.0) -> None:
-        ci95 = (value - half, value + half) if half else None
-        own = Strength(label=label, value=value, unit=facts[parameter].unit, ci95=ci95)
-        found.setdefault(parameter, []).append(own)
-
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
-    for slot, own, half in zip(twin.slots, twin.vector[twin.own :], reach[twin.own :], strict=True):
-        if slot.effect == cause.name:
-            add(slot.parameter, slot.label or "", float(own), float(half))
-    for parameter, value in twin.choices.get(cause.name, {}).items():
-        add(parameter, "", value)
+    fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), reach[twin.own :].tolist(), strict=True)
+    numbers = [(one.parameter, one.label or "", *own) for one, *own in fitted if one.effect == name]
+    facts, values = get_effect(name).parameters, twin.values({})[name]
+    numbers += [(key, "", value, 0.0) for key, value in values.items() if facts[key].kind == "choice"]
+    found = dict[str, list[Strength]]()
+    for key, label, value, half in numbers:
+        ci95 = (value - half, value + half) if half else None
+        own = Strength(label=label, value=value, unit=facts[key].unit, ci95=ci95)
+        found.setdefault(key, []).append(own)
     return found
 
 
@@ -206,38 +197,35 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
     """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
     sets = {other: one.name for one in added for other in one.confusable_with}
-    films = closed.study.of_films
+    films, first, last = closed.study.of_films, closed.named.first, closed.named.last
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
     tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
-    names = dict.fromkeys([*untestable, *tried])
-    found = []
-    for name in names:
-        if name not in seen and all(one.name != name for one in added):
-            verdict, reason = _refused(closed, name, sets, untestable)
-            last = closed.chosen.named.screened(name)
-            found.append(
-                Candidate(
-                    name=name,
-                    verdict=verdict,
-                    reason=reason,
-                    p_screen=closed.chosen.named.family_p.get(name),
-                    gain_nm2=last.gain_nm2 if last else None,
-                )
-            )
-    return found
+    told = {*seen, *(one.name for one in added)}
+    return [
+        Candidate(
+            name=name,
+            verdict=verdict,
+            reason=reason,
+            p_screen=first[name].family_p if name in first else None,
+            gain_nm2=last[name].gain_nm2 if name in last else None,
+        )
+        for name in dict.fromkeys([*untestable, *tried])
+        if name not in told
+        for verdict, reason in [_refused(closed, name, sets, untestable)]
+    ]
 
 
 def _refused(
     closed: Closed, name: str, sets: Mapping[str, str], untestable: Mapping[str, str]
 ) -> tuple[CandidateVerdict, str]:
     """Why an effect is not in the model."""
-    named, count = closed.chosen.named, len(closed.study.scans)
-    last, refused = named.screened(name), named.refused.get(name, "")
+    named, count = closed.named, len(closed.study.scans)
+    last, refused = named.last.get(name), named.refused.get(name, "")
     if name in untestable:
         return "not-testable", untestable[name]
     if name in sets:
         return "confusable", f"cannot be told from {sets[name]}, which was added"
-    if any(one.cause.name == name and one.reason for one in closed.chosen.checked):
+    if any(one.name == name for one in named.failed):
         return "resembles", refused
     if last is None:
         return "not-testable", "not screened"
@@ -247,7 +235,7 @@ def _refused(
         return "not-testable", "on these layouts it changes nothing that single scans do not"
     if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
         return "absorbed", "numbers of the base do the same: its fit has taken it up"
-    if not last.allowed and named.family_p[name] <= FAMILY_P:
+    if not last.allowed and named.first[name].family_p <= FAMILY_P:
         return "contradicted", "its best strength has the wrong sign"
     gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
     return "below-noise", refused or gained

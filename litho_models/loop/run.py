@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from torch import nn
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
 from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.loop.bases import AUTO, choose_base
-from litho_models.loop.closing import Closed, close, fit_with_measurement
+from litho_models.loop.bases import AUTO, bases_for
+from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, errors_of_others
 from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
@@ -29,7 +28,7 @@ from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
 from litho_models.loop.single_scans import SingleScans
-from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
+from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
 Nested = Literal["folds", "prints"]
@@ -91,33 +90,35 @@ def close_loop(
         whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
     ):
-        study = Study((), dealt(development, folds, seed), seed, places, report)
-        chosen = choose_base(
-            base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"), fields=base_settings
-        )
-        if nested and not is_refitted(chosen.model):
+        study = Study.dealt(development, folds, seed, places, report)
+        kept = Path(cache or f"{out}-cache")
+        bases = bases_for(base, study, steps=steps, cache=kept, fields=base_settings)
+        if nested and not all(map(is_refitted, bases.values())):
             raise InputError(
                 f"--nested with {base}", got="a model that is not fitted here", wanted="a small model's name"
             )
-        closed = close(development, study.fold_of, chosen.model, study)
-        held_out = HeldOut(closed)
-        errors = held_out.errors()
+        closed = close(study, bases)
+        own = {closed.base_name: bases[closed.base_name]}
+
+        def close_again(scans: Sequence[PrintedScan]) -> Closed:
+            return close(study.of_others(scans), own)
+
+        models = HeldOut(closed)
+        errors, left_out_nm, survives_on = models.errors(), models.left_out_nm(), models.survives_on()
+        planted = [plant(*one, closed, close_again) for one in wanted]
         often: dict[str, int] = {}
-        left_out_nm, survives_on = held_out.left_out_nm(), held_out.survives_on(chosen.others)
-        planted = [plant(*one, closed, _again(chosen.model, study)) for one in wanted]
         if nested:
-            rows, often = _nested(development, chosen.model, study, nested)
+            rows, often = _nested(study, nested, close_again)
             errors += rows
         if open_lock_box and locked:
-            errors += errors_of_others([(held_out, locked)], locked, "locked", seed)
-
+            errors += errors_of_others([(models, locked)], locked, "locked", seed)
         alone: list[ScanFinding] = []
-        residuals = held_out.residuals()
-        if not closed.study.of_films:
+        residuals = models.residuals()
+        if not study.of_films:
             report("looking at what single scans add")
-            maps = held_out.maps_um(closed.final)
-            terms = SingleScans(study, closed.original, maps).findings()
-            alone = with_marks(terms, marks(closed.original, maps, _rounding_um(opened, development)))
+            maps = models.maps_um(closed.final)
+            terms = SingleScans(study, study.scans, maps).findings()
+            alone = with_marks(terms, marks(study.scans, maps, _rounding_um(opened, development)))
         result = record(
             closed,
             errors,
@@ -126,11 +127,10 @@ def close_loop(
             survives_on=survives_on,
             run=run_info([seed], len(development), dropped),
             dataset=opened.dataset_id,
-            base_model=chosen.name,
-            measurement=fit_with_measurement(closed.final.twin, closed.original, seed).measurement,
+            measurement=models.fit(closed.final).measurement,
             planted=planted,
             settings=settings,
-            split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
+            split=Split(kind="grouped", folds=len(study.folds), lock_box=opened.locked_ids),
             chosen=often,
         )  # fmt: skip
         result, beside = further(closed, result) if further else (result, ())
@@ -159,39 +159,21 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
     return development, locked, [f"{one}: fewer than 1024 measured pixels" for one in dropped]
 
 
-def dealt(scans: Sequence[PrintedScan], folds: int, seed: int) -> np.ndarray:
-    """Number of the fold that holds out each scan; at most one fold per scan."""
-    ids = [scan.id for scan in scans]
-    lists = grouped_folds(ids, min(folds, len(ids)), seed)
-    fold = {one: number for number, members in enumerate(lists) for one in members}
-    return np.array([fold[one] for one in ids])
-
-
-def _again(base: nn.Module, study: Study) -> Callable[[Sequence[PrintedScan]], Closed]:
-    """The loop on other scans dealt alike, without a word."""
-
-    def close_again(scans: Sequence[PrintedScan]) -> Closed:
-        fold_of = dealt(scans, len(study.folds), study.seed)
-        quiet = replace(study, fold_of=fold_of, report=lambda message: None)
-        return close(scans, fold_of, base, quiet)
-
-    return close_again
-
-
 def _nested(
-    scans: Sequence[PrintedScan], base: nn.Module, study: Study, nested: Nested
+    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
     """All chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
+    scans = [scan.stored for scan in study.scans]
     ids = [scan.id for scan in scans]
     parts = (
-        [[ids[i] for i in np.flatnonzero(study.fold_of == fold).tolist()] for fold in study.folds]
+        [[ids[i] for i in own] for _, own in study.folds]
         if nested == "folds"
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
-    close_again, often = _again(base, study), Counter[str]()
+    often = Counter[str]()
 
     def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
-        for number, out in enumerate(parts, 1):
+        for number, out in enumerate(progress(parts, "choosing anew"), 1):
             study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)

@@ -11,7 +11,6 @@ from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.closing import Closed
 from litho_models.loop.folded_base import FoldedBase
-from litho_models.loop.model import Values
 from litho_models.loop.record import CloseLoop
 from litho_models.simulator import Simulator
 
@@ -30,26 +29,26 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
     """The corrected model of the printer, with the strengths that the latest scan has."""
     twin = closed.final.twin
-    base = twin.placed().base
+    base = twin.fitted_base
     if isinstance(base, FoldedBase):
         base = base.common
     assert isinstance(base, Simulator)
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
     values = twin.values(twin.labels(latest))
     sides = {"process": "printer", "measurement": "microscope"}
-    by_side: dict[str, Values] = {f"{side}_effects": {} for side in (*sides, "undetermined")}
-    for one in result.effects:
-        if one.name in values:
-            by_side[f"{one.role if one.role in sides else 'undetermined'}_effects"][one.name] = values[
-                one.name
-            ]
+
+    def on(*roles: str) -> dict[str, dict[str, float]]:
+        return {one.name: values[one.name] for one in result.effects if one.role in roles}
+
     error = result.error("all")
     assert error is not None
     save_frozen(
         base,
         folder,
         name=f"{result.base_model}, loop findings",
-        **by_side,
+        process_effects=on("process"),
+        measurement_effects=on("measurement"),
+        undetermined_effects=on("nuisance", "undetermined"),
         dataset=result.dataset.model_dump(mode="json"),
         attributed={
             one.name: sides[one.role]
@@ -61,8 +60,8 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
             **result.split.model_dump(mode="json"),
             "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
         },
-        training_level_share=level_share([scan.stored for scan in closed.original]),
-        training_step_share=step_share([scan.stored for scan in closed.original]),
+        training_level_share=level_share([scan.stored for scan in closed.given.scans]),
+        training_step_share=step_share([scan.stored for scan in closed.given.scans]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
             {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},

@@ -7,7 +7,7 @@ Its strength is one for all scans or one by group. Of each scan only inner produ
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,17 +15,20 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.fitting.least_squares import gram_inside
-from litho_models.loop.fits import State, Study
+from litho_models.loop.fits import State
+from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.trials import Secants, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
 # Of a direction's information, what must survive the projections for a test to mean anything.
 SMALLEST_RETAINED = 1e-5
+# Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
+WORTH_FITTING = 0.3
 PERMUTATIONS = 199
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Screened:
     """A trial with a way in which its strength goes, and what it gains on scans held out.
 
@@ -35,6 +38,8 @@ class Screened:
         multiples: by label, of the trial's amplitudes, from all scans.
         allowed: the strengths have a physical sign; ``retained``: share of the information that the terms of
             single scans and the model's own numbers leave, ``beside_base``: what the terms alone leave.
+        family_p: share of flips of the signs of the scans in which the largest gain of any candidate reaches
+            this one's; ``group_p``: of exchanges of the scans, where a grouping was held against them.
     """
 
     trial: Trial
@@ -44,6 +49,8 @@ class Screened:
     allowed: bool
     retained: float
     beside_base: float
+    family_p: float = 1.0
+    group_p: float | None = None
 
     @property
     def name(self) -> str:
@@ -66,7 +73,7 @@ class Screening:
     """Secants of all trials, and their inner products with what a fitted state leaves.
 
     Args:
-        state: the model so far; ``study``: its scans; ``effects``: candidates, none of them in the model.
+        state: the model so far; ``effects``: candidates, none of them in the model.
         secants: at another model, near enough to tell what is worth fitting; by default at the state.
         kept: numbers of the model that residual and columns are not freed of.
     """
@@ -74,39 +81,74 @@ class Screening:
     def __init__(
         self,
         state: State,
-        study: Study,
         effects: Sequence[Effect],
         secants: Secants | None = None,
         kept: Collection[int] = (),
     ):
-        self.study = study
+        self.study, self._mse_nm2 = state.study, state.mse_nm2
         own = len(state.twin.vector)
         self.trials = trials_of(effects, 1 + own)
-        secants = secants or Secants(state.twin, study.windows)
-        secants.learn(self.trials)
+        secants = secants or Secants(state.twin, self.study.windows)
+        parts = zip(state.held_out_um, state.linear, secants.of(self.trials), secants.free_terms, strict=True)
         grams, raw = [], np.array(1e-300)
-        for at, (left, part) in enumerate(zip(state.held_out_um, state.linear, strict=True)):
-            stacked = np.column_stack([left, *part.jacobian, *secants.of(self.trials, at)])
+        for left, part, rows, free in parts:
+            stacked = np.column_stack([left, *part.jacobian, *rows])
             whole = stacked.T @ stacked / len(stacked)
-            grams.append(whole - gram_inside(stacked, secants.free_terms(at)) / len(stacked))
+            grams.append(whole - gram_inside(stacked, free) / len(stacked))
             raw = raw + np.diag(whole)
-        products = Products(np.stack(grams), study.groups)
+        products = Products(np.stack(grams), self.study.groups)
         self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if i not in kept]).grams
         self._beside_base, self._retained = (
             np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)
         )
 
     @cached_property
-    def candidates(self) -> list[Screened]:
-        """The best trial of each effect in each grouping, the largest gain first."""
-        found: dict[tuple[str, str], Screened] = {}
+    def candidates(self) -> dict[str, dict[str, Screened]]:
+        """Of each effect, by grouping, the best trial."""
+        found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
+            own = found.setdefault(trial.effect.name, {})
             for by in self.study.groups:
-                one = self._candidate(trial, by)
-                best = found.get((one.name, by))
+                one, best = self._candidate(trial, by), own.get(by)
                 if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
-                    found[one.name, by] = one
-        return sorted(found.values(), key=lambda one: -one.gain_nm2)
+                    own[by] = one
+        common = np.array([own[ALL].gains_nm2 for own in found.values()]).T
+        largest = (sign_flips(len(common), self.study.seed) @ common).max(axis=1) if found else common
+
+        def judged(one: Screened) -> Screened:
+            reached = largest >= one.gains_nm2.sum() * (1 - 1e-9)
+            return replace(one, family_p=float(reached.mean()))
+
+        return {name: {by: judged(one) for by, one in own.items()} for name, own in found.items()}
+
+    @property
+    def common(self) -> dict[str, Screened]:
+        """The candidates with one strength for all scans."""
+        return {name: own[ALL] for name, own in self.candidates.items()}
+
+    def standing(self) -> list[Screened]:
+        """The candidates that stand out, each with the grouping that its scans ask for, by gain."""
+        standing = []
+        for own in self.candidates.values():
+            grouped = self._grouped(own)
+            chosen = grouped or own[ALL]
+            worth = chosen.gain_nm2 >= WORTH_FITTING * SMALLEST_SHARE * self._mse_nm2
+            if not chosen.allowed or chosen.retained < SMALLEST_RETAINED or not worth:
+                continue
+            if grouped or chosen.family_p <= FAMILY_P:
+                standing.append(chosen)
+        return sorted(standing, key=lambda one: -one.gain_nm2)
+
+    def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
+        """The grouping of a strength that gains beyond chance over one strength for all, or None."""
+        least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
+        better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
+        best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})
+        if best is None:
+            return None
+        one = better[best]
+        p = self.exchanged_p(best, one.gain_nm2, lambda labels: self._gains(one.trial, labels)[0])
+        return replace(one, group_p=p) if p <= EXCHANGED_P else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Alignment of what two candidates change, pooled over scans."""
@@ -120,91 +162,74 @@ class Screening:
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
 
-    def permutation_p(self, one: Screened) -> float:
-        """See ``permutation_p``."""
-        labels = self.study.groups[one.by]
-        return permutation_p(self.study, labels, one.gain_nm2, lambda by: self._gains(one.trial, by)[0])
-
-    def family_p(self, one: Screened) -> float:
-        """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
-        return float(np.mean(self._largest >= one.gains_nm2.sum() * (1 - 1e-9)))
-
-    @cached_property
-    def _largest(self) -> np.ndarray:
-        """Largest sum of gains over the candidates of one strength, for each flip of the scans' signs."""
-        gains = np.stack([one.gains_nm2 for one in self.candidates if one.by == ALL], axis=1)
-        return (sign_flips(len(gains), self.study.seed) @ gains).max(axis=1)
-
     def _candidate(self, trial: Trial, by: str) -> Screened:
         gains, multiples = self._gains(trial, self.study.groups[by])
-        largest = max(trial.sizes(own).max() for own in multiples.values())
         return Screened(
             trial=trial,
             by=by,
             gains_nm2=gains,
             multiples=multiples,
-            allowed=all(trial.allowed(own, largest) for own in multiples.values()),
+            allowed=trial.allowed(np.stack([*multiples.values()])),
             retained=float(self._retained[trial.columns].max()),
             beside_base=float(self._beside_base[trial.columns].max()),
         )
 
     def _gains(self, trial: Trial, labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Held-out gains (scans,) nm², and the multiples by label from all scans."""
-        return gains_by(
-            self.freed,
-            self.study.fold_of,
-            trial.columns,
-            labels,
-            lambda own: trial.allowed(own) * trial.reach(own),
-        )
+        return self.gains_by(labels, trial.columns, lambda own: trial.allowed(own) * trial.reach(own))
+
+    def gains_by(
+        self,
+        labels: Labels,
+        columns: Sequence[int],
+        taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Held-out gains (scans,) nm² of some columns with strengths by label, and those from all scans.
+
+        Args:
+            taken: share of the strengths that is taken.
+        """
+        own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
+        scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
+        gains, multiples = np.zeros(len(members)), {}
+        for label in dict.fromkeys(labels):
+            inside = members == label
+            score, info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
+            multiples[label] = _solved(info, score)
+            for fold in np.unique(fold_of[inside]):
+                out = inside & (fold_of == fold)
+                if out.sum() < inside.sum():
+                    found = _solved(info - infos[out].sum(axis=0), score - scores[out].sum(axis=0))
+                    found = found * taken(found)
+                    gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
+        return gains * NM_PER_UM**2, multiples
+
+    def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
+        """Share of exchanges of the scans after which a strength by any grouping gains as much as this one.
+
+        An exchange that leaves every scan beside the same others changes nothing, and is not counted.
+        """
+        groupings = {name: np.array(own) for name, own in self.study.groups.items() if name != ALL}
+        rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[by])
+        exchanged = beaten = 0
+        for _ in range(PERMUTATIONS):
+            order = rng.permutation(len(self.study.scans))
+            moved = [own[order] for own in groupings.values()]
+            if any((_beside(own) == judged).all() for own in moved):
+                continue
+            exchanged += 1
+            beaten += any(gains_of(tuple(own)).mean() >= gain_nm2 * (1 - 1e-12) for own in moved)
+        return (1 + beaten) / (1 + exchanged)
 
 
-def gains_by(
-    grams: np.ndarray,
-    fold_of: np.ndarray,
-    columns: Sequence[int],
-    labels: Labels,
-    taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Held-out gains (scans,) nm² of some columns with strengths by label, and those from all scans.
+def best_grouping(options: Mapping[str, tuple[float, int]]) -> str | None:
+    """The grouping that gains most; of those that do nearly as well the one with the fewest numbers.
 
     Args:
-        grams: (scans, 1 + m, 1 + m), residual first, µm²; ``taken``: share of the strengths that is taken.
+        options: by grouping its gain and its numbers. None where none gains.
     """
-    own, members = np.array(columns), np.array(labels)
-    scores, infos = grams[:, own, 0], grams[:, own[:, None], own[None, :]]
-    gains, multiples = np.zeros(len(grams)), {}
-    for label in dict.fromkeys(labels):
-        inside = members == label
-        total_score, total_info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
-        multiples[label] = _solved(total_info, total_score)
-        for fold in np.unique(fold_of[inside]):
-            out = inside & (fold_of == fold)
-            if out.sum() < inside.sum():
-                found = _solved(total_info - infos[out].sum(axis=0), total_score - scores[out].sum(axis=0))
-                found = found * taken(found)
-                gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
-    return gains * NM_PER_UM**2, multiples
-
-
-def permutation_p(
-    study: Study, labels: Labels, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]
-) -> float:
-    """Share of exchanges of the scans after which a strength by any grouping gains as much as by ``labels``.
-
-    An exchange that leaves every scan beside the same others changes nothing, and is not counted.
-    """
-    groupings = [np.array(own) for by, own in study.groups.items() if by != ALL]
-    rng, judged = np.random.default_rng(study.seed), _beside(np.array(labels))
-    exchanged = beaten = 0
-    for _ in range(PERMUTATIONS):
-        order = rng.permutation(len(study.scans))
-        moved = [own[order] for own in groupings]
-        if any((_beside(own) == judged).all() for own in moved):
-            continue
-        exchanged += 1
-        beaten += any(gains_of(tuple(own)).mean() >= gain_nm2 * (1 - 1e-12) for own in moved)
-    return (1 + beaten) / (1 + exchanged)
+    most = max((gain for gain, _ in options.values()), default=0.0)
+    close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}
+    return min(close, key=lambda by: close[by], default=None)
 
 
 def _beside(labels: np.ndarray) -> np.ndarray:

@@ -15,27 +15,17 @@ import numpy as np
 from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import (
-    EXCHANGED_P,
-    FAMILY_P,
-    GROUPED_P,
-    SMALLEST_SHARE,
-    Judgement,
-    judge,
-    told_apart,
-)
-from litho_models.loop.regrouping import best_grouping, regrouped
-from litho_models.loop.screening import SMALLEST_RETAINED, Screened, Screening
+from litho_models.loop.judging import EXCHANGED_P, GROUPED_P, Judgement, judge, told_apart
+from litho_models.loop.model import Twin, Values
+from litho_models.loop.screening import Screened, Screening, best_grouping
 from litho_models.loop.trials import Secants
-from litho_models.scan_terms.grouped import ALL
+from litho_models.scan_terms.grouped import ALL, Labels
 
-# Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
-WORTH_FITTING = 0.3
 # What changes the held-out prediction so alike cannot be told apart by its shape.
 SAME_COSINE = 0.8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cause:
     """An effect in the model.
 
@@ -45,6 +35,9 @@ class Cause:
         judgement: of its gain on held-out scans, the rest of the model in place.
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
         values: of its parameters by label, from which a table is fitted.
+        reshaped_share: what its change in other shapes would take beside it, of its gain.
+        reason: why its name does not stand, with everything else in place; empty if it does.
+        corrects: the reason is that it may only correct the formula of another.
     """
 
     name: str
@@ -53,32 +46,33 @@ class Cause:
     judgement: Judgement
     family_p: float
     group_p: float | None
-    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    values: Values = field(default_factory=dict)
+    reshaped_share: float | None = None
+    reason: str = ""
+    corrects: bool = False
 
 
 @dataclass
 class Found:
-    """What a search found: the model, its causes, and what is known of every other candidate."""
+    """What a search found: the model, its causes, and what is known of every other candidate.
+
+    ``failed``: causes whose name did not stand.
+    """
 
     state: State
     causes: list[Cause] = field(default_factory=list)
     first: dict[str, Screened] = field(default_factory=dict)
     last: dict[str, Screened] = field(default_factory=dict)
-    family_p: dict[str, float] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
+    failed: list[Cause] = field(default_factory=list)
 
     @property
     def names(self) -> list[str]:
         return [cause.name for cause in self.causes]
 
-    def screened(self, name: str) -> Screened | None:
-        """What was last known of a candidate; None if it never was one."""
-        return self.last.get(name) or self.first.get(name)
-
 
 def search(
     start: State,
-    study: Study,
     candidates: Sequence[Effect],
     most: int = 8,
     secants: Secants | None = None,
@@ -86,72 +80,89 @@ def search(
     """Add effects to a fitted model, at most so many.
 
     Args:
-        start: the model so far; ``study``: scans, folds and groups; ``candidates``: what may be added.
+        start: the model so far; ``candidates``: what may be added.
         secants: of the candidates at a model like this one; by default at the model itself.
     """
     found = Found(start)
-    while len(found.causes) < most and _add_one(found, study, candidates, secants):
+    while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
-    _defend(found, study)
+    _defend(found)
     return found
 
 
 def describe(
-    state: State, study: Study, tables: Sequence[Effect], most: int, secants: Secants | None = None
+    state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
     """Tables that stand out beside a model, each as a linear fit beside it alone."""
-    screening, found = Screening(state, study, tables, secants), []
-    for one in _standing(screening, Found(state))[:most]:
-        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
+    found: list[Cause] = []
+    for one in Screening(state, tables, secants).standing()[:most]:
+        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
         if judgement.passed(grouped=one.by != ALL):
-            found.append(replace(_cause(one, (), judgement, screening), values=one.start()))
+            found.append(Cause(one.name, one.by, (), judgement, one.family_p, one.group_p, one.start()))
     return found
 
 
-def _cause(one: Screened, alike: tuple[str, ...], judgement: Judgement, screening: Screening) -> Cause:
-    group_p = None if one.by == ALL else screening.permutation_p(one)
-    return Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p)
-
-
-def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: Secants | None) -> bool:
+def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None) -> bool:
+    study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]
     if not effects:
         return False
-    screening = Screening(found.state, study, effects, secants)
-    standing = _standing(screening, found)
-    study.report(f"{len(standing)} of {len(effects)} candidates stand out")
-    tried: set[str] = set()
-    for best in standing:
-        if best.name in tried:
-            continue
-        entering = [best, *_rivals(best, [one for one in standing if one.name not in tried], screening)]
-        fitted = _fitted(found.state, entering, study)
+    screening = Screening(found.state, effects, secants)
+    found.first, found.last = screening.common | found.first, found.last | screening.common
+    left = screening.standing()
+    study.report(f"{len(left)} of {len(effects)} candidates stand out")
+    while left:
+        entering = [left[0], *_rivals(left[0], left[1:], screening)]
+        left = [one for one in left if one not in entering]
+        fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
-            tried.add(one.name)
             judgement = judge(found.state.freed_nm2, fitted[one.name].freed_nm2, study)
             if refused := judgement.reason(grouped=one.by != ALL):
                 found.refused[one.name] = refused
                 continue
-            alike = _alike(one, fitted, found.state, screening, study)
-            found.causes.append(_cause(one, alike, judgement, screening))
+            alike = _alike(one, fitted, found.state, screening)
+            found.causes.append(Cause(one.name, one.by, alike, judgement, one.family_p, one.group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
             if one.by == ALL:
-                _regroup(found, study)
+                _regroup(found)
             gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
 
 
-def _regroup(found: Found, study: Study) -> None:
-    """Let the strength of the cause that was just added differ by group, if that is confirmed."""
-    cause = found.causes[-1]
-    other = regrouped(found.state, cause.name, study)
-    if other is None:
+def _regroup(found: Found) -> None:
+    """Let the strength of the cause that was just added differ by group, if that is confirmed.
+
+    The derivative where the effect stands says more than the one at its null, by which it was screened.
+    """
+    cause, twin, study = found.causes[-1], found.state.twin, found.state.study
+    slots = {
+        at: slot
+        for at, slot in enumerate(twin.slots, twin.own)
+        if slot.effect == cause.name and slot.facts.kind == "amplitude"
+    }
+    screening = Screening(found.state, (), kept=slots)
+
+    def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return screening.gains_by(labels, [1 + at for at in slots])
+
+    groups = {by: labels for by, labels in study.groups.items() if by != ALL}
+    gains = {by: float(gained(labels)[0].mean()) for by, labels in groups.items()}
+    by = best_grouping({by: (gain, len(set(groups[by]))) for by, gain in gains.items()})
+    if by is None:
         return
-    by, p, twin = other
-    state = fit_state(twin, study, from_here=True)
+    p = screening.exchanged_p(by, gains[by], lambda labels: gained(labels)[0])
+    if p > EXCHANGED_P:
+        return
+    known = twin.values({})[cause.name]
+    starts = {label: dict(known) for label in groups[by]}
+    for label, steps in gained(groups[by])[1].items():
+        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
+            value = known[slot.parameter] + step
+            starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
+    state = fit_state(twin.without(cause.name).with_effect(cause.name, by, starts), study, from_here=True)
     if judge(found.state.freed_nm2, state.freed_nm2, study).p <= GROUPED_P:
         study.report(f"{cause.name} differs by {by}")
         found.causes[-1] = replace(cause, by=by, group_p=p)
@@ -160,15 +171,12 @@ def _regroup(found: Found, study: Study) -> None:
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
     """The three that promise most beside the best, a third of its gain or more, and change much the same."""
-    return [
-        one
-        for one in standing
-        if one is not best and one.gain_nm2 >= 0.3 * best.gain_nm2 and abs(screening.cosine(best, one)) >= 0.5
-    ][:3]
+    near = (one for one in standing if one.gain_nm2 >= 0.3 * best.gain_nm2)
+    return [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]
 
 
 def _alike(
-    one: Screened, fitted: Mapping[str, State], before: State, screening: Screening, study: Study
+    one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
     """What these scans cannot tell from it: by fits where there are, by what is screened elsewhere."""
     own = fitted[one.name]
@@ -177,63 +185,30 @@ def _alike(
         for name, other in sorted(fitted.items(), key=lambda pair: pair[1].mse_nm2)
         if name != one.name
         and same_change(before, own, other)
-        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, study)
+        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, before.study)
     ]
+    others = (by[one.by] for name, by in screening.candidates.items() if name not in fitted)
     by_screening = [
         other.name
-        for other in screening.candidates
-        if other.by == one.by
-        and other.name not in fitted
-        and other.allowed
+        for other in sorted(others, key=lambda other: -other.gain_nm2)
+        if other.allowed
         and other.gain_nm2 >= 0.5 * one.gain_nm2
         and abs(screening.cosine(one, other)) >= SAME_COSINE
     ]
     return (*by_fit, *by_screening)
 
 
-def _standing(screening: Screening, found: Found) -> list[Screened]:
-    """The candidates that stand out, each with the grouping that its scans ask for, by gain."""
-    by_name: dict[str, list[Screened]] = {}
-    for one in screening.candidates:
-        by_name.setdefault(one.name, []).append(one)
-    mse = found.state.mse_nm2
-    worth = WORTH_FITTING * SMALLEST_SHARE * mse
-    standing = []
-    for name, own in by_name.items():
-        common = next(one for one in own if one.by == ALL)
-        found.first.setdefault(name, common)
-        found.last[name] = common
-        found.family_p.setdefault(name, screening.family_p(common))
-        chosen = _grouped(own, common, screening, mse) or common
-        if not chosen.allowed or chosen.retained < SMALLEST_RETAINED or chosen.gain_nm2 < worth:
-            continue
-        if chosen is common and screening.family_p(common) > FAMILY_P:
-            continue
-        standing.append(chosen)
-    return sorted(standing, key=lambda one: -one.gain_nm2)
-
-
-def _grouped(
-    own: Sequence[Screened], common: Screened, screening: Screening, mse_nm2: float
-) -> Screened | None:
-    """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
-    least = max(common.gain_nm2, 0.0) + SMALLEST_SHARE * mse_nm2
-    better = {one.by: one for one in own if one.by != ALL and one.allowed and one.gain_nm2 > least}
-    by = best_grouping(
-        {by: one.gain_nm2 for by, one in better.items()}, {by: one.numbers for by, one in better.items()}
-    )
-    return None if by is None or screening.permutation_p(better[by]) > EXCHANGED_P else better[by]
-
-
-def _fitted(state: State, entering: Sequence[Screened], study: Study) -> dict[str, State]:
+def _fitted(state: State, entering: Sequence[Screened]) -> dict[str, State]:
+    study = state.study
     jobs = [(one.name, state.twin.with_effect(one.name, one.by, one.start()), study) for one in entering]
-    return {name: own for (name, *_), own in run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])}
+    done = run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])
+    return {name: replace(own, study=study) for (name, *_), own in done}
 
 
-def _fit(job: tuple[str, object, Study]) -> State:
+def _fit(job: tuple[str, Twin, Study]) -> State:
     name, twin, study = job
     study.report(f"fitting {name}")
-    return fit_state(twin, study)  # type: ignore[arg-type]
+    return fit_state(twin, study)
 
 
 def same_change(before: State, one: State, other: State) -> bool:
@@ -246,13 +221,14 @@ def same_change(before: State, one: State, other: State) -> bool:
     return bool(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300) >= SAME_COSINE)
 
 
-def _defend(found: Found, study: Study) -> None:
+def _defend(found: Found) -> None:
     """Each cause is taken out, the rest fitted again: what is not confirmed with all others in place goes."""
     if len(found.causes) < 2:
         return
+    study = found.state.study
     for cause in list(found.causes):
         study.report(f"deciding once more on {cause.name}")
-        without = found.state.without(cause.name, study)
+        without = found.state.without(cause.name)
         judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
         at = found.causes.index(cause)
         if judgement.passed(grouped=cause.by != ALL):

@@ -7,7 +7,7 @@ on one half of a scan's pixels, fitted on the other half, must agree with what i
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -35,22 +35,6 @@ from litho_models.scan_terms import (
 from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
 
 
-@dataclass(frozen=True)
-class Freed:
-    """Scans freed of some of their terms: residual maps (y, x), µm, NaN where not scored."""
-
-    fits: Sequence[CrossFit]
-
-    @cached_property
-    def squares_nm2(self) -> np.ndarray:
-        """(scans,) mean squared error."""
-        return np.array([NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in self.fits])
-
-    @property
-    def rmse_nm(self) -> float:
-        return float(np.sqrt(self.squares_nm2.mean()))
-
-
 class SingleScans:
     """The scans beside the maps that they should show, with terms fitted on pixels that are not scored.
 
@@ -75,14 +59,12 @@ class SingleScans:
                     accepted |= terms_of_effect(name)
         return found + self._of_lines(lines, accepted | {"bow"})
 
-    def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> Freed:
+    def _freed(self, maps_um: Sequence[np.ndarray], terms: Terms) -> list[CrossFit]:
         blocks = Blocks(seed=self.study.seed)
-        return Freed(
-            [
-                cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line)
-                for scan, own in zip(self.scans, maps_um, strict=True)
-            ]
-        )
+        return [
+            cross_fit(scan.stored.height_um, own, scan.usable, terms, blocks, scan_line=scan.line)
+            for scan, own in zip(self.scans, maps_um, strict=True)
+        ]
 
     def _of_terms(self, name: str, accepted: Terms) -> ScanFinding:
         effect, own = get_effect(name), terms_of_effect(name)
@@ -93,9 +75,15 @@ class SingleScans:
         # Where scans of one print are alike, the printer may have done it too.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
+        terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
+        rmse_nm = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
+        told = (
+            f"RMSE on pixels not fitted {rmse_nm[0]:.2f} -> {rmse_nm[1]:.2f} nm with {terms[1]:.0f} "
+            f"instead of {terms[0]:.0f} terms per scan"
+        )
         return ScanFinding.of(
             name,
-            _evidence(judgement, before, after),
+            "; ".join(filter(None, (judgement.reason(), told))),
             role="undetermined" if unclear else effect.role,
             seen=judgement.passed(),
             p=judgement.p,
@@ -105,12 +93,11 @@ class SingleScans:
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
         """(scans, k) of ``own`` terms, fitted beside all ``terms``; displacements in µm."""
         found = []
+        lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):
             design = scan.terms_at_sample(prediction, terms)
             fitted = least_squares(design, scan.height - scan.at_sample(prediction))
-            fitted[_columns_of((t.name for t in chosen_terms(own) if t.unit == "px"), terms)] *= (
-                scan.context.pitch_um
-            )
+            fitted[lengths] *= scan.context.pitch_um
             found.append(fitted[_columns_of(own, terms)])
         return np.stack(found)
 
@@ -129,27 +116,28 @@ class SingleScans:
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
-        after = {name: self._freed(by_row, accepted | terms_of_effect(name)) for name in names}
-        gains = {name: before.squares_nm2 - own.squares_nm2 for name, own in after.items()}
-        control = [self._freed(by_column, terms) for terms in (accepted, accepted | {"layout-columns"})]
-        columns = control[0].squares_nm2 - control[1].squares_nm2
+        judged = {
+            name: _as_variance(before, self._freed(by_row, accepted | terms_of_effect(name)), self.study)
+            for name in names
+        }
+        bare, freed = (self._freed(by_column, terms) for terms in (accepted, accepted | {"layout-columns"}))
+        columns = _as_variance(bare, freed, self.study).gains_nm2
         found = []
         for at, name in enumerate(names):
             (other,) = (one for one in names if one != name)
-            beaten, better = (
-                one_sided_flip_p(sign * (gains[other] - gains[name])) <= CONFIRM_P for sign in (1, -1)
-            )
-            judgement = _as_variance(before, after[name], self.study)
-            excess_p = one_sided_flip_p(gains[name] - columns)
+            gains = judged[name].gains_nm2
+            behind = judged[other].gains_nm2 - gains
+            beaten, better = (one_sided_flip_p(sign * behind) <= CONFIRM_P for sign in (1, -1))
+            excess_p = one_sided_flip_p(gains - columns)
             excess = "" if excess_p <= CONFIRM_P else f"rows gain no more than columns (p = {excess_p:.3f})"
             follows = ""
             if beaten:
                 follows = f"the lines follow {_frame(other)} more closely: {other}"
             elif at and not better:
                 follows = f"cannot be told from {other}: no scan is turned enough against its layout"
-            reasons = [*filter(None, (judgement.reason(), excess, follows))]
-            deviation = np.sqrt(np.maximum(gains[name], 0).mean()) / NM_PER_UM
-            taken = f"{gains[name].mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
+            reasons = [*filter(None, (judged[name].reason(), excess, follows))]
+            deviation = np.sqrt(np.maximum(gains, 0).mean()) / NM_PER_UM
+            taken = f"{gains.mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
             found.append(
                 ScanFinding.of(
                     name,
@@ -171,11 +159,11 @@ class SingleScans:
             return list(self.maps_um)
         totals = np.stack([one.sum(axis=axis) for one in self._smooth_um])
         seen = np.stack([scan.usable.sum(axis=axis) for scan in self.scans])
-        found = []
-        for fold, own in zip(self.study.fold_of, self.maps_um, strict=True):
-            others = self.study.fold_of != fold
+        found = list(self.maps_um)
+        for others, own in self.study.folds:
             profile = totals[others].sum(axis=0) / np.maximum(seen[others].sum(axis=0), 1)
-            found.append(own + np.expand_dims(profile, axis))
+            for i in own:
+                found[i] = found[i] + np.expand_dims(profile, axis)
         return found
 
     def _period(self, name: str) -> str:
@@ -184,19 +172,18 @@ class SingleScans:
         It is looked for at all frequencies at once.
         """
         (term,) = line_terms(terms_of_effect(name))
+        assert term.lines is not None
         means = []
         for scan, residual in zip(self.scans, self._smooth_um, strict=True):
-            assert term.lines is not None
             line, use = term.lines(scan.usable.shape, scan.line), scan.usable
             count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
             means.append(total / np.maximum(count, 1))
         found = line_period(means, self.scans[0].stored.pitch_um)
         if found is None or found.p > 1e-3:
             return ""
-        share = 100 * found.share
         return (
-            f"; they repeat every {found.period_um:.3g} µm, with {share:.0f} % of the squared line means "
-            f"(p = {found.p:.1g})"
+            f"; they repeat every {found.period_um:.3g} µm, with {100 * found.share:.0f} % of the squared "
+            f"line means (p = {found.p:.1g})"
         )
 
     @cached_property
@@ -208,23 +195,12 @@ class SingleScans:
         ]
 
 
-def _as_variance(before: Freed, after: Freed, study: Study) -> Judgement:
+def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
     """A scan whose own term happens to be near zero gains nothing: the halves have to agree instead."""
-    products = [
-        np.nanmean(one.residual_um * (one.residual_um - left.residual_um))
-        for one, left in zip(before.fits, after.fits, strict=True)
-    ]
-    judged = judge(before.squares_nm2, after.squares_nm2, study)
-    return replace(judged, p=one_sided_flip_p(np.array(products)))
-
-
-def _evidence(judgement: Judgement, before: Freed, after: Freed) -> str:
-    terms = [np.mean([fit.degrees_of_freedom for fit in own.fits]) for own in (before, after)]
-    said = (
-        f"RMSE on pixels not fitted {before.rmse_nm:.2f} -> {after.rmse_nm:.2f} nm with {terms[1]:.0f} "
-        f"instead of {terms[0]:.0f} terms per scan"
-    )
-    return "; ".join(filter(None, (judgement.reason(), said)))
+    residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
+    was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
+    products = [np.nanmean(one * (one - left)) for one, left in zip(*residuals_um, strict=True)]
+    return replace(judge(was, now, study), p=one_sided_flip_p(np.array(products)))
 
 
 def _frame(effect: str) -> str:

@@ -10,12 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from litho_models.effects import Effect, get_effect
+from litho_models.effects import Effect
 from litho_models.loop.fits import ALL_FREE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
-
-_Key = tuple[str, tuple[tuple[str, float], ...]]
 
 
 @dataclass(frozen=True)
@@ -36,22 +34,18 @@ class Trial:
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """How far these multiples of the sets take each amplitude (amplitudes,) from its null."""
+        """How far multiples (…, sets) take each amplitude (…, amplitudes) from its null."""
         return multiples @ _steps(self.effect, self.sets)
 
-    def sizes(self, multiples: np.ndarray) -> np.ndarray:
-        """The same without signs, in those of ordinary values."""
-        return np.abs(self.steps(multiples)) / self._facts[3]
-
-    def allowed(self, multiples: np.ndarray, largest: float = 0.0) -> bool:
+    def allowed(self, multiples: np.ndarray) -> bool:
         """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there.
 
-        Noise is what is small beside the largest amplitude, or beside ``largest``, that of any group.
+        Noise is what is small beside the largest amplitude of any group; multiples (…, sets).
         """
-        (null, lower, upper, _), steps = self._facts, self.steps(multiples)
+        (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
-        sizes = self.sizes(multiples)
-        return not (sizes[wrong] > 0.3 * max(largest, sizes.max())).any()
+        sizes = np.abs(steps) / usual
+        return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
         """Share of the step that stays within the ranges: a straight line from the null overshoots."""
@@ -98,34 +92,34 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
 
 class Secants:
-    """What trials change in the windows at a model; what is known of one is not computed again."""
+    """What trials change in the windows at a model; what is known of one is not computed again.
+
+    Attributes:
+        free_terms: orthonormal basis (n, k) of what each window may add by itself.
+    """
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
-        self._placed, self._windows = twin.placed(), windows
-        self._known: dict[_Key, list[NDArray[np.float32]]] = {}
+        self._twin, self._windows = twin, windows
+        self._bases_um = [twin.base_height(twin.exposed(one), one) for one in windows]
+        pairs = zip(windows, self._bases_um, strict=True)
+        self._heights_um = [twin.height(one, base_um=base) for one, base in pairs]
+        heights = zip(windows, self._heights_um, strict=True)
+        self.free_terms = [one.free_basis(height, ALL_FREE) for one, height in heights]
+        self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
 
-    def learn(self, trials: Sequence[Trial]) -> None:
-        """Compute what is not known yet."""
-        new = [key for key in _keys(trials) if key not in self._known]
-        self._known |= {key: [] for key in new}
-        for window in self._windows if new else ():
-            base = self._placed.base_height(self._placed.exposed(window), window)
-            here = self._placed.height(window, base_um=base)
-            for name, values in new:
-                effect = get_effect(name)
-                known = base if effect.acts_on == "height" else None
-                moved = self._placed.height(window, {name: effect.with_values(dict(values))}, known)
-                self._known[name, values].append(window.at_sample(moved - here).astype(np.float32))
+    def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
+        """For each window the changes (n,), µm, of each set of each trial."""
+        rows = []
+        for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
+            key = effect.name, *values.items()
+            if key not in self._known:
+                self._known[key] = self._changes(effect, values)
+            rows.append(self._known[key])
+        return [[row[at] for row in rows] for at in range(len(self._windows))]
 
-    def of(self, trials: Sequence[Trial], number: int) -> list[NDArray[np.float32]]:
-        """Changes (n,), µm, in one window, a row for each set of each trial."""
-        return [self._known[key][number] for key in _keys(trials)]
-
-    def free_terms(self, number: int) -> np.ndarray:
-        """Orthonormal basis (n, k) of what one window may add by itself."""
-        window = self._windows[number]
-        return window.free_basis(self._placed.height(window), ALL_FREE)
-
-
-def _keys(trials: Sequence[Trial]) -> list[_Key]:
-    return [(trial.effect.name, tuple(values.items())) for trial in trials for values in trial.sets]
+    def _changes(self, effect: Effect, values: Mapping[str, float]) -> list[NDArray[np.float32]]:
+        extra, found = {effect.name: effect.with_values(values)}, []
+        for window, base, here in zip(self._windows, self._bases_um, self._heights_um, strict=True):
+            moved = self._twin.height(window, extra, base if effect.acts_on == "height" else None)
+            found.append(window.at_sample(moved - here).astype(np.float32))
+        return found

@@ -83,14 +83,14 @@ class Judge:
         left = {}
         windows = [*self.study.windows, *(scan.window for scan in self.new)]
         for name, twin, fit in zip(names, twins, fit_rivals(twins, windows), strict=True):
-            placed = twin.at(fit.vector).placed()
-            left[name] = [left_nm(scan, placed.height(scan)) for scan in self.new]
+            fitted = twin.at(fit.vector)
+            left[name] = [left_nm(scan, fitted.height(scan)) for scan in self.new]
         return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
         """Analysis of variance of a term of single scans: prints against repeats."""
-        placed, own = self.twin.placed(), terms_of_effect(question.name)
-        scans = SingleScans(self.study, self.new, [placed.height(scan) for scan in self.new])
+        own = terms_of_effect(question.name)
+        scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
         by_print: dict[str, list[np.ndarray]] = {}
         for scan, values in zip(
             self.new, scans.coefficients(own, own | {"offset", "gain", "bow"}), strict=True
@@ -112,10 +112,10 @@ class Judge:
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
             return _decision(question, self.new, BOTH, "no scan is turned", UNSEEN)
-        placed, rows, lines = self.twin.placed(), [], 0
+        rows, lines = [], 0
         for scan in turned:
             used, index = scan.usable, row_index(scan.usable.shape)
-            residual = freed_um(scan.stored.height_um, placed.height(scan), used, frozenset({"offset"}))
+            residual = freed_um(scan.stored.height_um, self.twin.height(scan), used, frozenset({"offset"}))
             offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in (index, scan.line))
             rows.append([*offsets, residual[used].var() / used.shape[1]])
             lines += len(used)

@@ -20,13 +20,13 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import RULES, held_out_maps
+from litho_models.loop.fits import RULES
 from litho_models.loop.learner import Learner
 from litho_models.loop.model import Twin
 from litho_models.loop.record import CloseLoop
 from litho_models.loop.results import clustered_covariance, independent
-from litho_models.loop.screening import Screened
-from litho_models.loop.search import WORTH_FITTING, Cause, separating
+from litho_models.loop.screening import WORTH_FITTING, Screened
+from litho_models.loop.search import Cause, separating
 from litho_models.planning.questions import (
     Kind,
     OpenQuestions,
@@ -85,7 +85,7 @@ class _Asking:
     def __init__(self, closed: Closed, report: Callable[[str], None]):
         self.closed, self.study, self.report = closed, closed.study, report
         self.twin = closed.final.twin.ungrouped()
-        self.maps = held_out_maps(closed.final.per_fold, closed.study, closed.study.scans)
+        self.maps = closed.final.maps_um(closed.study.scans)
         self.left_nm = self._left_by(self.maps)
         self.noise = noise_spectrum(self.left_nm)
 
@@ -95,22 +95,20 @@ class _Asking:
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
-        chosen = self.closed.chosen
         # In the place of another a member starts as before any of them was found.
-        first = {**chosen.lawful.first, **chosen.named.first}
+        first = {**self.closed.lawful.first, **self.closed.named.first}
         twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
-        rests = list(self.closed.rests.values())
         return _question(
             "set" if cause.alike else "role",
             members,
             rivals=self._rivals(members, twins),
             spread=self._spread(cause.name),
-            form_nm=rests[-1].most_nm if rests else None,
+            form_nm=[*self.closed.rests.values()][-1].most_nm,
         )
 
     def of_suspects(self) -> Question | None:
         """What stood out and was not confirmed: which of these carries what is left, if any does."""
-        named = self.closed.chosen.named
+        named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
             one
@@ -125,8 +123,8 @@ class _Asking:
         rivals = self._rivals(names, twins)
         # The loop knows the error of its form with none of them in, which is theirs as well.
         learner = Learner(self.study, self.maps)
-        placed = [rival.twin(self.twin.alone()).placed() for rival in rivals]
-        rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in placed]
+        fitted = [rival.twin(self.twin.alone()) for rival in rivals]
+        rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
         return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
 
     def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> list[Rival]:
@@ -163,8 +161,7 @@ class _Asking:
         |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a. What groups differ by is
         in d: one more of them does not make its prints contradict each other.
         """
-        other = self.closed.final.without(name, self.study)
-        without = held_out_maps(other.per_fold, self.study, self.study.scans)
+        without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
         for before, after in zip(self._left_by(without), self.left_nm, strict=True):
             change = np.nan_to_num(before - after)

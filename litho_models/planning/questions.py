@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store.schema import DatasetId
+from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
 from litho_models.loop.fits import ALL_FREE, RULES, TwinProblem
 from litho_models.loop.model import Twin
@@ -114,12 +115,9 @@ class Rival(Record):
         """The model, in which an effect goes with the print or with the scan; ``bare``: its base alone."""
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
-        own = frozenset([self.effect])
-        return replace(
-            bare.at(np.array(self.vector)),
-            scan_frame=own if self.owner == "microscope" else frozenset(),
-            print_frame=own if self.owner == "printer" else frozenset(),
-        )
+        frames: dict[Owner, Frame] = {"microscope": "scan", "printer": "print"}
+        own = {self.effect: frames[self.owner]} if self.owner else {}
+        return replace(bare.at(np.array(self.vector)), frames=own)
 
 
 class Question(Record):

@@ -74,11 +74,6 @@ class Printing:
     highest: int
     write_field_um: float | None = None
 
-    @property
-    def full_height_um(self) -> float:
-        """Of the highest level."""
-        return self.highest * self.level_height_um
-
     def reach_um(self, printed: PlannedPrint) -> float:
         """How far the centre of a print lies from that of the write field, along both axes."""
         if printed.place == "centre" or self.write_field_um is None:
@@ -91,7 +86,7 @@ class Printing:
         return FieldContext(
             layout_um,
             self.pitch_um,
-            self.full_height_um,
+            self.highest * self.level_height_um,
             self.level_height_um,
             (reach_um, reach_um),
             None if self.write_field_um is None else self.write_field_um / 2,
@@ -151,8 +146,7 @@ class Rivalry:
         self.question = question
         self.printing = printing
         self.noise = noise
-        bare = Twin.of_base(base, printing.full_height_um, printing.pitch_um)
-        self.twins = [rival.twin(bare) for rival in question.rivals]
+        self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
         # What is true, if a rival is; refits start from ``twins``.
         self.true = self.chains = [_chain(twin) for twin in self.twins]
 
@@ -259,7 +253,7 @@ class Rivalry:
 
 
 def _chain(twin: Twin) -> EffectChain:
-    return twin.placed().of_labels().requires_grad_(False)
+    return twin.chain().requires_grad_(False)
 
 
 def _inner(field: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ from litho_design.workflows.compare import compare
 from litho_models.boards.board import make_draws
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
-from litho_models.loop.bases import choose_base
+from litho_models.loop.bases import bases_for
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.search import _fitted
 from litho_models.scan_terms.grouped import ALL
@@ -162,18 +162,18 @@ def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str,
         SimpleNamespace(name=name, by=ALL, start=lambda: {"": {"strength": 0.01}})
         for name in (law, "height-power-2")
     ]
-    one, other = (_fitted(state, entering, study) for study in studies)
+    one, other = (_fitted(replace(state, study=study), entering) for study in studies)
     assert set(one) == set(other) == {law, "height-power-2"}
     for name, own in one.items():
         assert all(
             (a.vector == b.vector).all() for a, b in zip(own.per_fold, other[name].per_fold, strict=True)
         )
         assert (own.freed_nm2 == other[name].freed_nm2).all()
-    found = [SimpleNamespace(original=here.scans, study=study) for study in studies]
+    found = [SimpleNamespace(given=study) for study in studies]
     maps = [HeldOut(one).maps_um(state) for one in found]
     assert all((own == its).all() for own, its in zip(*maps, strict=True))
     bases = [
-        choose_base("features", scans, replace(study, scans=()), steps=None, cache=tmp_path / name).model
+        bases_for("features", study, cache=tmp_path / name)["features"]
         for name, study in zip("ab", studies, strict=True)
     ]
     assert len(bases[0].models) == len(bases[1].models) == 2

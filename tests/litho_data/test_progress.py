@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
 
 from litho_data.commands import progress as module
-from litho_data.commands.progress import progress, say_estimate
+from litho_data.commands.app import new_app, run_app
+from litho_data.commands.progress import progress, say, say_estimate
 
 # Items, how many at once, seconds of each and of the start of the workers.
 WORK = {
@@ -54,6 +56,47 @@ def test_an_estimate_is_within_a_factor_of_two(
     assert list(progress(results(), work, count, at_once=at_once)) == list(range(count))
     ((estimated_s, told_s),) = said
     assert 0.5 <= estimated_s / (clock.now_s - told_s) <= 2
+
+
+def silent() -> None:
+    """Work until somebody says so."""
+    until_s = time.monotonic() + 20
+    while module._silent.is_set() and time.monotonic() < until_s:
+        time.sleep(0.01)
+
+
+def spoken() -> None:
+    """Say what is done, and do it for longer than one may be silent."""
+    say("working")
+    time.sleep(1)
+
+
+@pytest.mark.parametrize(
+    ("work", "within_s", "said"),
+    [(silent, 0.01, "litho-test is at work\n"), (spoken, 0.5, "working\n"), (list, 60.0, "")],
+)
+def test_a_command_that_says_nothing_is_said_to_be_at_work(
+    work: Callable[[], object],
+    within_s: float,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert module._SILENT_S <= 3
+    monkeypatch.setattr(module, "_SILENT_S", within_s)
+    app = new_app("test")
+
+    @app.command()
+    def begin() -> None:
+        work()
+
+    @app.command()
+    def other() -> None: ...
+
+    monkeypatch.setattr("sys.argv", ["litho-test", "begin"])
+    with pytest.raises(SystemExit):
+        run_app(app, "litho-test")
+    assert capsys.readouterr().err == said
 
 
 def test_what_takes_less_than_a_minute_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,12 +74,11 @@ def planted(
     rng = np.random.default_rng(seed)
     scans = blank_scans(count, size_px)
     prepared = prepare_scans(scans)
-    twin = Twin.bare(base or base_model(), prepared[0])
+    twin = Twin.bare(base or base_model())
     for name, by, values in effects:
         twin = twin.with_effect(name, by, values)
-    placed = twin.placed()
     heights = [
-        placed.height(scan) + 0.02 * rng.normal() + rng.normal(0, noise_um, scan.stored.shape)
+        twin.height(scan) + 0.02 * rng.normal() + rng.normal(0, noise_um, scan.stored.shape)
         for scan in prepared
     ]
     return with_heights(scans, heights)
@@ -93,4 +92,4 @@ def study_of(scans: Sequence[PrintedScan], folds: int = 3, seed: int = 0) -> Stu
 
 def bare_state(study: Study) -> State:
     """The base alone, fitted."""
-    return fit_state(Twin.bare(base_model(), study.scans[0]), study)
+    return fit_state(Twin.bare(base_model()), study)

@@ -17,7 +17,7 @@ from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.frozen.card import ModelCard
 from litho_models.loop import closing
-from litho_models.loop.bases import choose_base
+from litho_models.loop.bases import bases_for
 from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.fits import Study, fit_state
@@ -52,12 +52,9 @@ def no_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "TABLES", {})
 
 
-def settings_of(scans: Sequence[PrintedScan]) -> Study:
-    return replace(study_of(scans), scans=())
-
-
 def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:
-    return choose_base(base, scans, settings_of(scans), steps=None, cache=cache).model
+    (model,) = bases_for(base, study_of(scans), cache=cache).values()
+    return model
 
 
 def trained(scans: Sequence[PrintedScan]) -> Simulator:
@@ -86,12 +83,12 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
     """From the training of the base to the law, the print and what scans share."""
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
-    study = settings_of(scans)
+    study = study_of(scans)
     out = np.flatnonzero(study.fold_of == 1).tolist()
     other = [s.height_um + 0.2 * s.layout_um**2 if i in out else s.height_um for i, s in enumerate(scans)]
     maps, fitted = [], []
     for own in (scans, with_heights(scans, other)):
-        closed = close(own, study.fold_of, bases_of(own, study)[base], study)
+        closed = close(study_of(own), {base: bases_of(own, study)[base]})
         # With a law in the model: its number is fitted too.
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1].vector)
@@ -104,11 +101,11 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
 
 def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
     scans = planted(count=6)
-    study = settings_of(scans)
+    study = study_of(scans)
     model = bases_of(scans, study)["trained per fold"]
     assert isinstance(model, FoldedBase)
     assert len(model.models) == len(study.folds)
-    assert Twin.bare(model, study_of(scans).scans[0]).own == 0
+    assert Twin.bare(model).own == 0
 
     def numbers(one: nn.Module) -> list[float]:
         return [float(p.detach()) for p in one.parameters()]
@@ -134,8 +131,8 @@ class Carrying(nn.Module):
 def test_what_a_trained_model_lacks_is_added_and_what_it_carries_is_not() -> None:
     study = study_of(planted([(LAW, ALL, {"": STRENGTH})]))
     for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
-        start = fit_state(Twin.bare(base, study.scans[0]), study)
-        found = search(start, study, [get_effect(LAW), get_effect("height-power-2")])
+        start = fit_state(Twin.bare(base), study)
+        found = search(start, [get_effect(LAW), get_effect("height-power-2")])
         assert found.names == names
         assert found.state.twin.own == 0
         # White noise of 4 nm is all that is left.
@@ -147,7 +144,7 @@ def test_what_a_trained_model_lacks_is_added_and_what_it_carries_is_not() -> Non
 def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -> None:
     scans = planted(count=4)
     model = chosen("zoo:pbl", scans, tmp_path)
-    assert Twin.bare(model, study_of(scans).scans[0]).own == 0
+    assert Twin.bare(model).own == 0
     coarse = [replace(scan, pitch_um=0.2) for scan in scans]
     with pytest.raises(InputError, match=r"pitch of zoo:pbl, got 0.1 µm, wanted 0.2 µm"):
         chosen("zoo:pbl", coarse, tmp_path)

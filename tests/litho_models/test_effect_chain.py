@@ -19,7 +19,7 @@ MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement" and not 
 
 def chain_of(effects: dict[str, dict[str, float]]) -> EffectChain:
     base = build_model("physics", sigma_diffusion_init_um=0.3)
-    return EffectChain(base, effects, full_height_um=1.2, pitch_um=0.1)
+    return EffectChain(base, effects)
 
 
 def test_without_effects_the_chain_is_the_base_bit_for_bit() -> None:

@@ -29,8 +29,8 @@ Change = Callable[[PreparedScan, np.ndarray], np.ndarray]
 def scene() -> tuple[Study, list[np.ndarray], Learner]:
     """Scans, what they show but for their noise, and the learner of them."""
     study = study_of(planted(size_px=96, noise_um=NOISE_UM), folds=5)
-    placed = Twin.bare(base_model(), study.scans[0]).placed()
-    predictions = [placed.height(scan) for scan in study.scans]
+    twin = Twin.bare(base_model())
+    predictions = [twin.height(scan) for scan in study.scans]
     return study, predictions, Learner(study, predictions)
 
 

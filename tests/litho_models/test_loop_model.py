@@ -43,27 +43,27 @@ def study():
 
 @pytest.fixture(scope="module")
 def twin(study) -> Twin:
-    return Twin.bare(base_model(), study.scans[0]).with_effect(THINNING, "field", BY_FIELD)
+    return Twin.bare(base_model()).with_effect(THINNING, "field", BY_FIELD)
 
 
 def test_the_bare_twin_is_the_base(study) -> None:
     scan = study.scans[0]
-    bare = Twin.bare(base_model(), scan)
+    bare = Twin.bare(base_model())
     np.testing.assert_allclose(bare.vector, [0.9, 0.03], rtol=1e-6)
     assert bare.names == ()
     blurred = gaussian_filter(scan.stored.layout_um, BLUR_UM / PITCH_UM, mode="nearest", truncate=4)
-    np.testing.assert_allclose(bare.placed().height(scan), 0.9 * blurred + 0.03, atol=1e-5)
+    np.testing.assert_allclose(bare.height(scan), 0.9 * blurred + 0.03, atol=1e-5)
 
 
 def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin) -> None:
-    assert twin.slots == (
+    assert twin.slots == [
         Slot(THINNING, "along_x_um", "1"),
         Slot(THINNING, "along_x_um", "2"),
         Slot(THINNING, "along_y_um", "1"),
         Slot(THINNING, "along_y_um", "2"),
         Slot(THINNING, "exponent", None),
         Slot(THINNING, "turn_deg", None),
-    )
+    ]
     assert twin.own == 2
     assert twin.values({"field": "2"}) == {THINNING: thinning(0.2)}
 
@@ -72,8 +72,8 @@ def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, st
     assert twin.values({"field": "9"})[THINNING]["along_x_um"] == pytest.approx(0.15)
     stored = replace(study.scans[0].stored, groups={"field": "9"})
     elsewhere = replace(study.scans[0], stored=stored)
-    one = Twin.bare(base_model(), elsewhere).with_effect(THINNING, ALL, {"": thinning(0.15)})
-    np.testing.assert_allclose(twin.placed().height(elsewhere), one.placed().height(elsewhere), atol=1e-6)
+    one = Twin.bare(base_model()).with_effect(THINNING, ALL, {"": thinning(0.15)})
+    np.testing.assert_allclose(twin.height(elsewhere), one.height(elsewhere), atol=1e-6)
 
 
 def test_a_group_behind_which_there_is_no_scan_has_the_mean_of_the_others(twin: Twin, study) -> None:
@@ -94,8 +94,8 @@ def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> N
 
 def test_directions_are_chosen_and_never_fitted(study) -> None:
     lag = {"length_um": 0.2, "direction": -1.0}
-    twin = Twin.bare(base_model(), study.scans[0]).with_effect("galvo-lag", ALL, {"": lag})
-    assert twin.slots == (Slot("galvo-lag", "length_um", None),)
+    twin = Twin.bare(base_model()).with_effect("galvo-lag", ALL, {"": lag})
+    assert twin.slots == [Slot("galvo-lag", "length_um", None)]
     assert twin.values({}) == {"galvo-lag": lag}
 
 
@@ -107,7 +107,7 @@ def test_effects_act_in_their_order_however_they_came_and_leave_no_trace(twin: T
     )
     assert more.names == ("long-range-proximity", THINNING, "resampling-blur")
     back = more.without("resampling-blur").without("long-range-proximity")
-    assert (back.by, back.choices, back.slots) == (twin.by, twin.choices, twin.slots)
+    assert (back.effects, back.slots) == (twin.effects, twin.slots)
     assert np.array_equal(back.vector, twin.vector)
     with_first = more.without(THINNING)
     assert with_first.own == 2
@@ -116,14 +116,14 @@ def test_effects_act_in_their_order_however_they_came_and_leave_no_trace(twin: T
 
 def test_effects_off_change_no_prediction(study) -> None:
     scan = study.scans[0]
-    bare = Twin.bare(base_model(), scan)
+    bare = Twin.bare(base_model())
     twin = bare.with_effect(THINNING, "field", {"1": thinning(0.0), "2": thinning(0.0)})
-    assert np.array_equal(twin.placed().height(scan), bare.placed().height(scan))
+    assert np.array_equal(twin.height(scan), bare.height(scan))
 
 
 def test_moving_the_twin_does_not_move_its_base(twin: Twin, study) -> None:
     before = [p.detach().clone() for p in twin.base.parameters()]
-    twin.at(twin.vector + 0.1).placed().height(study.scans[0])
+    twin.at(twin.vector + 0.1).height(study.scans[0])
     assert all((a == b).all() for a, b in zip(before, twin.base.parameters(), strict=True))
 
 
@@ -133,12 +133,12 @@ def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin
     steps = twin.steps()
     linear = TwinProblem(twin, study.windows).linearise(twin.vector)
     for window, part in zip(study.windows, linear, strict=True):
-        here = window.at_sample(twin.placed().height(window))
+        here = window.at_sample(twin.height(window))
         np.testing.assert_allclose(part.residual, window.height - here, atol=1e-12)
         for at, step in enumerate(steps):
             moved = twin.vector.copy()
             moved[at] += step
-            there = window.at_sample(twin.at(moved).placed().height(window))
+            there = window.at_sample(twin.at(moved).height(window))
             # Heights are float32: two of them, over the step.
             np.testing.assert_allclose(part.jacobian[at], (there - here) / step, atol=4e-7 / abs(step))
 
@@ -180,7 +180,7 @@ def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> N
     state = bare_state(study)
     for at, scan in enumerate(study.scans):
         fold = study.fold_of[at]
-        prediction = state.per_fold[fold].placed().height(scan)
+        prediction = state.per_fold[fold].height(scan)
         left = scan.height - scan.at_sample(prediction)
         np.testing.assert_allclose(state.held_out_um[at], left, atol=1e-12)
         freed = without_terms(left[:, None], scan, prediction)
@@ -202,9 +202,8 @@ def test_a_scan_says_nothing_about_its_own_prediction(by: str) -> None:
         study = replace(study_of(own), fold_of=fold_of)
         labels = set(study.groups[by])
         values = {label: {"strength": 0.0} for label in labels}
-        state = fit_state(Twin.bare(base_model(), study.scans[0]).with_effect(law, by, values), study)
-        placed = state.per_fold[1].placed()
-        found.append(np.stack([placed.height(scan) for scan in study.scans[2:4]]))
+        state = fit_state(Twin.bare(base_model()).with_effect(law, by, values), study)
+        found.append(np.stack([state.per_fold[1].height(scan) for scan in study.scans[2:4]]))
     # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left.
     assert np.abs(found[1] - found[0]).max() < 1e-3 * 0.3
 
@@ -213,7 +212,7 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
     base = base_model()
     for parameter in base.parameters():
         parameter.requires_grad_(False)
-    twin = Twin.bare(base, study.scans[0])
+    twin = Twin.bare(base)
     assert len(twin.vector) == twin.own == 0
     state = fit_state(twin, study)
     assert [len(one.vector) for one in state.per_fold] == [0, 0, 0]
@@ -252,7 +251,7 @@ def test_two_blurs_are_known_together_only(study) -> None:
     """What the resist and the microscope blur one after the other: their sum is known, not the parts."""
     blurs = [(name, {"variance_um2": 0.02}) for name in ("diffusion-blur", "resampling-blur")]
     alike = study_of(planted([(name, ALL, {"": values}) for name, values in blurs]))
-    twin = Twin.bare(base_model(), alike.scans[0])
+    twin = Twin.bare(base_model())
     for name, values in blurs:
         twin = twin.with_effect(name, ALL, {"": values})
     pairs = {frozenset(pair): value for *pair, value in confounded(fit_state(twin, alike))}
@@ -260,12 +259,12 @@ def test_two_blurs_are_known_together_only(study) -> None:
     assert -1 <= min(pairs.values()) < -0.95
     # A blur and a loss on slopes are told apart, and so are gain and offset of the base.
     (name, values), _ = blurs
-    apart = Twin.bare(base_model(), study.scans[0]).with_effect(name, ALL, {"": values})
+    apart = Twin.bare(base_model()).with_effect(name, ALL, {"": values})
     assert confounded(fit_state(apart.with_effect(THINNING, ALL, {"": thinning(0.15)}), study)) == []
 
 
 def test_without_fitted_numbers_nothing_is_confounded(study) -> None:
-    frozen = Twin.bare(base_model().requires_grad_(False), study.scans[0])
+    frozen = Twin.bare(base_model().requires_grad_(False))
     assert confounded(fit_state(frozen, study)) == []
 
 
@@ -278,7 +277,7 @@ def test_what_the_base_took_of_an_effect_does_not_keep_a_fit_from_it(depth_um: f
         "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
     )
     study = study_of(planted([(effect.name, ALL, {"": deep})], count=4, seed=3, base=made), folds=2)
-    fitted = fit_state(Twin.bare(build_model("physics"), study.scans[0]), study)
+    fitted = fit_state(Twin.bare(build_model("physics")), study)
     shallow = effect.with_values({"depth_um": depth_um})
     state = fit_state(fitted.twin.with_effect(effect.name, ALL, {"": shallow}), study)
     # White noise of 4 nm is left.

@@ -24,14 +24,16 @@ from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze
 from litho_models.loop import bases, closing, run
-from litho_models.loop.closing import Closed, close, freed_scans
+from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import REPORTED, HeldOut, error_rows
+from litho_models.loop.fits import Study
+from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import CloseLoop, Explained
 from litho_models.loop.report import said
 from litho_models.loop.results import _verdict, clustered_covariance
-from litho_models.loop.run import close_loop, dealt
+from litho_models.loop.run import close_loop
 from litho_models.loop.saving import save_model
 from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
@@ -175,7 +177,7 @@ def test_the_page_holds_the_answer_and_nothing_from_elsewhere(closed) -> None:
     assert before is not None
     assert f"{before.mae_nm:.2f}" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
-    assert said[0].startswith("fitting the base model on 10 scans")
+    assert said[0].startswith("fitting affine-mtf to 10 scans")
 
 
 def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) -> None:
@@ -200,12 +202,11 @@ def test_only_what_is_the_printers_is_exported(closed, store: Path, tmp_path: Pa
     opened = open_store(store)
     scans = prepare_scans(opened.scans())
     roles_of = {"galvo-lag": "process", "slope-thinning": "undetermined", "tip-dilation": "measurement"}
-    twin = Twin.bare(base_model(), scans[0])
+    twin = Twin.bare(base_model())
     for name in roles_of:
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values({})})
-    found = SimpleNamespace(
-        final=SimpleNamespace(twin=twin), study=SimpleNamespace(scans=scans), original=scans
-    )
+    study = SimpleNamespace(scans=scans)
+    found = SimpleNamespace(final=SimpleNamespace(twin=twin), study=study, given=study)
     effects = [SimpleNamespace(name=n, role=role, confusable_with=[]) for n, role in roles_of.items()]
     save_model(found, result.model_copy(update={"effects": effects}), opened, tmp_path / "model")  # type: ignore[arg-type]
     card = ModelCard.read(tmp_path / "model")
@@ -242,7 +243,7 @@ def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
         found = SimpleNamespace(
             study=SimpleNamespace(scans=[None] * count),
             rests={"base": SimpleNamespace(matters=True), "all": SimpleNamespace(matters=matters)},
-            chosen=SimpleNamespace(named=SimpleNamespace(refused={"one": "reason"} if refused else {})),
+            named=SimpleNamespace(refused={"one": "reason"} if refused else {}),
         )
         return _verdict(found, [SimpleNamespace(knowledge=one) for one in knowledge])  # type: ignore[arg-type]
 
@@ -288,14 +289,14 @@ def test_a_scan_is_freed_by_what_the_others_say() -> None:
     bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
     study = study_of(bowed)
     state = bare_state(study)
-    freed = freed_scans(bowed, state, study)
+    freed = freed_scans(state)
     taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
     # Half of the difference between the fields is in each, shrunk.
     for scan, own in zip(bowed, taken, strict=True):
         sign = 1 if scan.groups["field"] == "2" else -1
         assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
     other = [replace(bowed[0], height_um=bowed[0].height_um + _bow(bowed[0].shape)), *bowed[1:]]
-    again = freed_scans(other, state, study)
+    again = freed_scans(replace(state, study=study_of(other)))
     np.testing.assert_allclose(other[0].height_um - again[0].height_um, taken[0], atol=1e-6)
     assert np.abs(other[1].height_um - again[1].height_um - taken[1]).max() > 1e-4
 
@@ -307,21 +308,22 @@ def _bow(shape: tuple[int, int]) -> np.ndarray:
 
 def test_folds_hold_every_scan_out_once() -> None:
     scans = make_scans(7, 48)
-    fold_of = dealt(scans, 5, 0)
-    assert set(fold_of) == set(range(5))
-    assert len(set(dealt(scans[:3], 5, 0))) == 3
-    assert np.array_equal(fold_of, dealt(scans, 5, 0))
+    study = Study.dealt(scans, 5)
+    assert sorted(i for _, own in study.folds for i in own) == list(range(7))
+    assert all(sorted(rest + own) == list(range(7)) for rest, own in study.folds)
+    assert len(study.folds) == 5
+    assert len(Study.dealt(scans[:3], 5).folds) == len(study.of_others(scans[:3]).folds) == 3
+    assert np.array_equal(study.fold_of, Study.dealt(scans, 5).fold_of)
 
 
 def test_a_base_is_asked_for_by_name_or_the_best_is_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scans = planted(count=4)
-    study = replace(study_of(scans), scans=())
+    study = study_of(planted(count=4))
 
     def chosen(base: str) -> tuple[str, list[str]]:
-        found = bases.choose_base(base, scans, study, steps=None, cache=tmp_path)
-        return found.name, [*found.others]
+        closed = close(study, bases.bases_for(base, study, cache=tmp_path))
+        return closed.base_name, [*closed.others]
 
     assert chosen("affine") == ("affine", [])
     monkeypatch.setattr(bases, "_COMPETING", ("identity", "affine"))
@@ -379,8 +381,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
 def test_scans_of_different_sizes_are_taken_together(quick: None) -> None:
     single = [planted(count=1, size_px=size)[0] for size in (48, 56, 64, 48)]
     scans = [replace(scan, id=f"S{number}", order=number) for number, scan in enumerate(single)]
-    study = replace(study_of(scans, 2), scans=())
-    found = close(scans, study.fold_of, base_model(), study)
+    found = close(study_of(scans, 2), {BASE: base_model()})
     rows = HeldOut(found).errors()
     assert {tuple(row.by_scan_nm) for row in rows} == {tuple(scan.id for scan in scans)}
     assert np.isfinite([row.mae_nm for row in rows]).all()
@@ -393,14 +394,13 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     law, seen = "slope-x-power-1", []
     monkeypatch.setattr(closing, "LAWS", {law: get_effect(law)})
 
-    def watched(scans: Sequence[PrintedScan], *given: Any, **named: Any) -> Closed:
+    def watched(scans: Sequence[PrintedScan]) -> Closed:
         seen.append({scan.print_id for scan in scans})
-        return close(scans, *given, **named)
+        return close(study_of(scans), {BASE: base_model()})
 
-    monkeypatch.setattr(run, "close", watched)
     made = planted([(law, ALL, {"": {"strength": 0.05}})], count=12)
     scans = [replace(scan, print_id=str(number // 4)) for number, scan in enumerate(made)]
-    rows, often = run._nested(scans, base_model(), replace(study_of(scans), scans=()), "prints")
+    rows, often = run._nested(study_of(scans), "prints", watched)
     assert seen == [{"1", "2"}, {"0", "2"}, {"0", "1"}]
     # The law is chosen in every selection, and its gain lasts.
     assert often == {law: 3}

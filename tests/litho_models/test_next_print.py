@@ -29,7 +29,7 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
-from litho_models.effects.chain import EffectChain
+from litho_models.effects.chain import EffectChain, Frame
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
@@ -77,7 +77,7 @@ QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 def model(effects: dict[str, dict[str, float]]) -> Twin:
     """The base of ``loop_scans`` with effects."""
-    twin = Twin.of_base(base_model(), 1.2, 0.1)
+    twin = Twin.bare(base_model())
     for name, values in effects.items():
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values(values)})
     return twin
@@ -165,26 +165,19 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
     plain = FieldContext(layout, 0.1, 1.2)
     values = {"length_um": 0.3, "rising": 0.5, "direction": 1.0}
     lag, thinning = get_effect("feedback-lag"), get_effect("slope-thinning")
-    chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values}, full_height_um=1.2, pitch_um=0.1)
+    chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values})
     seen = chain.after_base(height, replace(plain, quarter_turns=1))
     by_hand = torch.rot90(lag(torch.rot90(height, 1, (-2, -1)), values, plain), -1, (-2, -1))
     assert torch.equal(seen, by_hand)
     back = chain.after_base(height, replace(plain, backward=True))
     assert torch.allclose(back, lag(height, {**values, "direction": -1.0}, plain))
     amounts = thinning.with_values({"along_x_um": 0.2})
-    for frame, axis in (((), "along_x_um"), (("slope-thinning",), "along_y_um")):
-        chain = EffectChain(
-            torch.nn.Identity(),
-            {"slope-thinning": amounts},
-            full_height_um=1.2,
-            pitch_um=0.1,
-            scan_frame=frame,
-        )
+    frames: tuple[dict[str, Frame], ...] = ({}, {"slope-thinning": "scan"})
+    for own, axis in zip(frames, ("along_x_um", "along_y_um"), strict=True):
+        chain = EffectChain(torch.nn.Identity(), {"slope-thinning": amounts}, own)
         expected = thinning(height, thinning.with_values({axis: 0.2}), plain)
         assert torch.allclose(chain.after_base(height, replace(plain, quarter_turns=1)), expected, atol=1e-6)
-    tip = EffectChain(
-        torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}}, full_height_um=1.2, pitch_um=0.1
-    )
+    tip = EffectChain(torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}})
     assert torch.equal(tip.after_base(height, replace(plain, new_tip=True)), height)
     assert not torch.equal(tip.after_base(height, plain), height)
 
@@ -231,7 +224,7 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
 def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rivalry, limits: Limits) -> None:
     """Scans of one print share it, so that along their sum it is larger than along each."""
     prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
-    plain = model({}).placed().of_labels({}).requires_grad_(False)
+    plain = model({}).chain().requires_grad_(False)
     found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
     # Single precision.
     assert found.noise_nm == pytest.approx(NOISE_NM * math.sqrt(scans), rel=1e-4)
@@ -260,11 +253,11 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
     prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
     twin = rivalry.twins[0]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
-    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).placed().of_labels({})
+    faded = twin.at(np.where(np.arange(len(twin.vector)) == slot, 1e-5, twin.vector)).chain()
     faded.requires_grad_(False)
     found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
     with torch.no_grad():
-        plain = model({}).placed().of_labels({})
+        plain = model({}).chain()
         heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (rivalry.chains[0], plain)]
     # Gain, registration, tilt and bow take some of what is lost on slopes, not two thirds of it.
     assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
@@ -423,7 +416,7 @@ def second_round(
     """Two prints, each scanned at 0 and 90 degrees, an effect of the printer or of the microscope."""
     random = np.random.default_rng(seed)
     [name] = effects
-    chain = rival(name, effects, owner).twin(model({})).placed().of_labels({})
+    chain = rival(name, effects, owner).twin(model({})).chain()
     scans = []
     for number, blank in enumerate(blank_scans(12, 64)[-2:]):
         rough = gaussian_filter(random.normal(size=blank.shape), 1.0)
@@ -522,7 +515,7 @@ def single_scans(name: str, heights_um: Callable[[PreparedScan, int], np.ndarray
             scan = replace(blank, id=f"N{number}F{at}", print_id=str(number), scan_to_layout=placed)
             [one] = prepare_scans([scan])
             noise = random.normal(0, 0.004, blank.shape)
-            scans += with_heights([scan], [base.placed().height(one) + noise + heights_um(one, number)])
+            scans += with_heights([scan], [base.height(one) + noise + heights_um(one, number)])
     judge_ = Judge(base, study_of(scans), prepare_scans(scans))
     kind = "lines" if "line" in name else "per-scan"
     question = slope_question(name=name, kind=kind, rivals=[])
@@ -651,13 +644,13 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
         "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
     )
     twins = [
-        Twin.of_base(base, 1.2, 0.1).with_effect(name, ALL, {"": {"variance_um2": 0.1}})
+        Twin.bare(base).with_effect(name, ALL, {"": {"variance_um2": 0.1}})
         for name in ("diffusion-blur", "resampling-blur")
     ]
     random = np.random.default_rng(0)
-    placed, blank = twins[0].placed(), blank_scans(4, 64)
+    twin, blank = twins[0], blank_scans(4, 64)
     heights = [
-        placed.height(scan) + 0.006 * gaussian_filter(random.normal(size=(64, 64)), 1.0) / 0.28
+        twin.height(scan) + 0.006 * gaussian_filter(random.normal(size=(64, 64)), 1.0) / 0.28
         for scan in prepare_scans(blank)
     ]
     windows = [scan.window for scan in prepare_scans(with_heights(blank, heights))]

@@ -25,9 +25,9 @@ LAW = "slope-x-power-1"
 def closed_on(scans: Sequence[PrintedScan]) -> Closed:
     """The search among two laws, and nothing else of the loop."""
     study = study_of(scans)
-    base = fit_state(Twin.bare(base_model(), study.scans[0]), study)
-    found = search(base, study, [get_effect(LAW), get_effect("height-power-2")])
-    return SimpleNamespace(base=base, original=study.scans, causes=found.causes, final=found.state)  # type: ignore[return-value]
+    base = fit_state(Twin.bare(base_model()), study)
+    found = search(base, [get_effect(LAW), get_effect("height-power-2")])
+    return SimpleNamespace(base=base, given=study, named=found, final=found.state)  # type: ignore[return-value]
 
 
 def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they_were() -> None:
@@ -43,10 +43,10 @@ def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they
     # So much smaller that the change is linear in the amount.
     assert large.rms_nm / tiny.rms_nm == pytest.approx(0.04 / 0.0002, rel=1e-2)
     changes = []
-    for scan in closed.original:
+    for scan in closed.given.scans:
         bare, there = closed.base.twin, {"": {"strength": 0.04}}
-        here = bare.placed().height(scan)
-        change = bare.with_effect(LAW, "all", there).placed().height(scan) - here
+        here = bare.height(scan)
+        change = bare.with_effect(LAW, "all", there).height(scan) - here
         changes.append(np.mean(without_terms(scan.at_sample(change)[:, None], scan, here) ** 2))
     assert large.rms_nm == pytest.approx(NM_PER_UM * np.sqrt(np.mean(changes)), rel=1e-4)
 

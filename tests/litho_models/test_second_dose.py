@@ -52,7 +52,7 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
     )
     assert np.abs(half_dose - half_levels).max() > 0.01
     own = {"layer-stacking": {"share": 0.8, "threshold": 0.6, "steepness": 8.0}}
-    chain = EffectChain(torch.nn.Identity(), own, full_height_um=1.2, pitch_um=0.1)
+    chain = EffectChain(torch.nn.Identity(), own)
     wide = PlannedPrint(torch.full((40, 40), 12.0), PLAIN, dose=0.5)
     with torch.no_grad():
         middle = float(Printing(0.1, 0.1, 12).predict(chain, wide, Way())[20, 20])
@@ -63,7 +63,7 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
 
 
 def test_plan_and_loop_see_a_dose_as_the_fab_does() -> None:
-    chain = EffectChain(base_model(), {}, full_height_um=1.2, pitch_um=0.1)
+    chain = EffectChain(base_model(), {})
     printing = Printing(0.1, 0.1, 12)
     level = as_tensor(_even_levels())
     with torch.no_grad():

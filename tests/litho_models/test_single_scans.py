@@ -28,8 +28,8 @@ Change = Callable[[PreparedScan, np.random.Generator], np.ndarray]
 
 
 def truths(scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-    placed = Twin.bare(base_model(), scans[0]).placed()
-    return [placed.height(scan) for scan in scans]
+    twin = Twin.bare(base_model())
+    return [twin.height(scan) for scan in scans]
 
 
 def found_with(

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -153,7 +152,7 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     from litho_data.store import open_store
     from litho_models.evaluation.results import Evaluation
     from litho_models.frozen.freezing import freeze
-    from litho_models.loop.bases import choose_base
+    from litho_models.loop.bases import bases_for
     from litho_models.loop.fits import Study
     from litho_models.noise.residuals import read_residuals
 
@@ -164,8 +163,7 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
     assert Evaluation.read(tmp_path / "out").model.name == name
     assert freeze(named, tmp_path / "frozen").weights_sha256 == ModelCard.read(there).weights_sha256
-    nobody = Study((), np.zeros(0, int))
-    assert choose_base(named, open_store(store).scans(), nobody, steps=None, cache=tmp_path).name == name
+    assert [*bases_for(named, Study.dealt(open_store(store).scans(), 2), cache=tmp_path)] == [name]
     assert read_residuals(open_store(store), [named]).model == name
     for wrong, said in (("zoo:resnet", name), (name, f"did you mean {named}")):
         with pytest.raises(InputError, match=said):

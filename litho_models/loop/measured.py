@@ -1,0 +1,70 @@
+"""Printer and measurement: fitted together to scans, and scans freed of what a group of them shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from litho_data.store import PrintedScan
+from litho_models.fitting.least_squares import fit_least_squares
+from litho_models.loop.fits import RULES, State, TwinProblem
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepared_among
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.measurement_fit import learn_measurement
+
+
+class Fit(NamedTuple):
+    """Printer and measurement fitted to the same scans."""
+
+    twin: Twin
+    measurement: MeasurementModel
+
+    @property
+    def numbers(self) -> tuple[int, int]:
+        """Fitted numbers of printer and measurement."""
+        return len(self.twin.vector), self.measurement.numbers
+
+    def expected_um(self, scan: PreparedScan) -> np.ndarray:
+        """The map (y, x) that a scan should show."""
+        return self.measurement.expected_um(scan.stored, self.twin.height(scan))
+
+
+def freed_scans(state: State) -> list[PrintedScan]:
+    """The scans without what those of a group share beside their prints.
+
+    What all scans share stays in: a cause may have it. A scan is freed by what was learned without its fold.
+    """
+    study = state.study
+    maps = state.maps_um(study.scans)
+    scans = [scan.stored for scan in study.scans]
+    freed = list(scans)
+    for own, held_out in study.folds:
+        if len(own) < 2:
+            continue
+        learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
+        differences = learned.between_groups()
+        for i in held_out:
+            freed[i] = differences.freed(scans[i], maps[i])
+    return freed
+
+
+def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
+    """Printer and measurement fitted to the same scans, one after the other, and the strengths once more.
+
+    Args:
+        twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
+        refit: the printer, once the measurement is known; or leave it where it is.
+    """
+    stored = [scan.stored for scan in scans]
+    maps = [twin.height(scan) for scan in scans]
+    measurement = learn_measurement(stored, maps, seed=seed)
+    if refit and len(twin.vector):
+        freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
+        windows = [scan.window for scan in prepared_among(freed, scans)]
+        twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        maps = [twin.height(scan) for scan in scans]
+        measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
+    return Fit(twin, measurement)
