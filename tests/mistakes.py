@@ -128,6 +128,11 @@ MISTAKES: dict[str, dict[str, str]] = {
         "steps without end": "litho-design hoe --model none --learning-rate 1e300 --out new",
         "an effect beyond what it can be": "litho-models close-loop prints.zarr "
         "--inject diffusion-blur=1e300 --out new",
+        "a spot beyond its bound": "litho-models close-loop prints.zarr --base physics "
+        "--set sigma_optical_um=1e15 --out new",
+        "a pixel that the scans state": "litho-models train prints.zarr --model affine --set pitch_um=0.2 "
+        "--out new",
+        "write fields without end": "litho-data simulate --stitch-field-um inf --out new",
         "an alarm more often than not": "litho-models check printer prints.zarr --reference other.zarr "
         "--false-alarms nan --out new",
         "heights in a picture of numbers": "litho-data inspect raw/scans/P11.txt --full-scale-um inf",

@@ -73,7 +73,12 @@ def fit_with_record(
     geometry = common_geometry(scans)
     started = time.monotonic()
     torch.manual_seed(config.seed)
-    model = build_model(model_name, config.variant, **geometry, **{**config.model, **(model_fields or {})})
+    fields = {**config.model, **(model_fields or {})}
+    for name in geometry.keys() & fields.keys():
+        raise InputError(
+            f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
+        )
+    model = build_model(model_name, config.variant, **geometry, **fields)
     # Also for a model that leaves no checkpoint: the folder may hold another's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from litho_data.foundation.errors import InputError
+
 # A sigmoid has 7 % of its slope left, and is 2 % of the range away from the bound.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
@@ -37,7 +39,13 @@ class Range:
         return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
 
     def raw(self, value: float) -> Tensor:
-        """The raw number of a value inside the range; ``ValueError`` or ``ArithmeticError`` outside."""
+        """The raw number of a value.
+
+        Raises:
+            InputError: a value outside the range, or on a bound.
+        """
+        if not self.lower < value < self.upper:
+            raise InputError(self.name, got=value, wanted=f"between {self.lower:g} and {self.upper:g}")
         above = value - self.lower
         if math.isinf(self.upper):
             return torch.tensor(math.log(math.expm1(above)))
