@@ -188,7 +188,7 @@ def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
 
 
 def _check_effects(card: ModelCard) -> None:
-    """Refuse process effects that are none, or whose values no printer has."""
+    """Refuse names that are no process effects, and values that no printer can have."""
     from litho_models.effects import get_effect
 
     for name, values in card.process_effects.items():

@@ -1,7 +1,7 @@
 """The noise of prints that were not made to measure it, from the out-of-fold residuals of a model.
 
-Two estimates that err on the same side: what differs between like surroundings (``estimated_floor``), and how
-rough the places are where the layout is flat, so that a model has little to get wrong.
+Two estimates, too high rather than too low: what differs between like surroundings (``estimated_floor``), and
+the roughness where the layout is flat, so that a model has little to get wrong.
 """
 
 from collections.abc import Sequence

@@ -181,8 +181,8 @@ def _budget(page: Page, found: NoiseBudget) -> None:
     page.heading("Noise budget", folded=True)
     page.paragraph(
         f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
-        "the model lacks counts as noise unless like surroundings share it. What levelling took out of the "
-        "scans before is missing, a few percent of the variance."
+        "the model lacks counts as noise unless like surroundings share it. What levelling removed from the "
+        "scans is missing, a few percent of the variance."
     )
     if found.floor.by_policy:
         page.table(

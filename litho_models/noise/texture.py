@@ -41,7 +41,7 @@ class Lines(Record):
         along: ``x`` (rows) or ``y`` (columns).
         share: of the variance of the surface that is in the means of the lines. A surface without lines has
             a share too: compare the two axes.
-        period: the strongest of these means; None below 64 lines.
+        period: the strongest one of these means; None below 64 lines.
     """
 
     along: str

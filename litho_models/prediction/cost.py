@@ -19,7 +19,7 @@ _RESET_PEAK = "5"  # see proc(5): the peak of resident memory starts again from 
 
 
 class PredictionCost(Record):
-    """Medians over scans; memory is what a prediction takes beyond what is held anyway, None if not known."""
+    """Medians over scans; memory is what a prediction needs beyond what was in use; None if not known."""
 
     seconds_per_scan: float
     peak_memory_mib: float | None

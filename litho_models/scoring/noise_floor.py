@@ -71,7 +71,7 @@ UNKNOWN_FLOOR = NoiseFloor(
 
 
 class _StatedFloor(Result):
-    """What is read of a noise analysis here: whose it is, and the floor."""
+    """The part of a noise analysis that is read here: its dataset, and the floor."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -142,11 +142,11 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """An upper estimate of the floor, from residuals of scans that a model had not seen.
 
-    Of drawn pixels the part of the squared error that like surroundings do not share is found
-    (``LikePixels``); the errors over all scored pixels times its root are the floor. For the mean absolute
-    error this takes the shape of the noise, E|n|/σ, to be that of the residual, which is noise but for a few
-    percent of its squares: no Gaussian is assumed. A misfit of half the squares and of another shape (Laplace
-    in Gaussian noise or the reverse) would make it wrong by up to 6 %.
+    On drawn pixels ``LikePixels`` finds the part of the squared error that like surroundings do not share.
+    The floor is the error over all scored pixels times the root of this part. For the mean absolute error
+    this assumes that the noise has the shape, E|n|/σ, of the residual, of whose squares noise is all but a
+    few percent: no Gaussian is assumed. If a misfit had half of the squares and another shape (Laplace in
+    Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.
