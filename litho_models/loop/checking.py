@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, fit_state, held_out_maps, without_terms
+from litho_models.loop.fits import State, Study, fit_state, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
@@ -44,13 +44,17 @@ class Check:
     laws: Sequence[Effect]
     left_nm2: float
     secants: Secants
-    study: Study
+
+    @property
+    def study(self) -> Study:
+        """What the model is fitted to."""
+        return self.state.study
 
     def of(self, cause: Cause) -> Cause:
         """One of the causes, judged with everything else in place."""
-        without = self.state.without(cause.name, self.study)
+        without = self.state.without(cause.name)
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
-        reshaped_nm2 = reshaped_gain(without, self.state, self.study)
+        reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
         unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
         larger = "" if unneeded else self._larger(cause, without)
@@ -77,8 +81,8 @@ class Check:
             if gain_nm2 < 0.1 * other.judgement.gain_nm2:
                 if get_effect(other.name).knowledge == "law":
                     return other.name
-                neither = without.without(other.name, self.study)
-                if reshaped_gain(neither, without, self.study) >= 0.5 * gain_nm2:
+                neither = without.without(other.name)
+                if reshaped_gain(neither, without) >= 0.5 * gain_nm2:
                     return other.name
         return ""
 
@@ -88,7 +92,7 @@ class Check:
         Two laws at most, with no more numbers than the cause has.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
-        state = self.state.without(cause.name, self.study)
+        state = self.state.without(cause.name)
         laws: list[str] = []
         while len(laws) < 2 and (law := self._best_law(state, numbers)):
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
@@ -104,21 +108,21 @@ class Check:
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
             one
-            for own in Screening(state, self.study, laws, self.secants).candidates.values()
+            for own in Screening(state, laws, self.secants).candidates.values()
             for one in own.values()
             if one.allowed and one.numbers <= numbers and one.gain_nm2 > least
         )
         return max(promising, key=lambda one: one.gain_nm2, default=None)
 
 
-def reshaped_gain(without: State, state: State, study: Study) -> float:
+def reshaped_gain(without: State, state: State) -> float:
     """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
 
     Args:
         without, state: the model without and with the cause.
     """
-    grams = []
-    before, after = (held_out_maps(one.per_fold, study, study.windows) for one in (without, state))
+    grams, study = [], state.study
+    before, after = (one.maps_um(study.windows) for one in (without, state))
     for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)

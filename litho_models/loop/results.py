@@ -146,12 +146,13 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
     fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), reach[twin.own :].tolist(), strict=True)
     numbers = [(one.parameter, one.label or "", *own) for one, *own in fitted if one.effect == name]
-    numbers += [(parameter, "", value, 0.0) for parameter, value in twin.choices[name].items()]
+    facts, values = get_effect(name).parameters, twin.values({})[name]
+    numbers += [(key, "", value, 0.0) for key, value in values.items() if facts[key].kind == "choice"]
     found = dict[str, list[Strength]]()
-    for parameter, label, value, half in numbers:
-        unit = get_effect(name).parameters[parameter].unit
+    for key, label, value, half in numbers:
         ci95 = (value - half, value + half) if half else None
-        found.setdefault(parameter, []).append(Strength(label=label, value=value, unit=unit, ci95=ci95))
+        own = Strength(label=label, value=value, unit=facts[key].unit, ci95=ci95)
+        found.setdefault(key, []).append(own)
     return found
 
 

@@ -30,7 +30,7 @@ def share(planted_name: str, fitted_name: str, beside: tuple[str, ...] = (), see
     state = fit_state(without.twin.with_effect(fitted_name, ALL, {"": values_of(fitted_name)}), study)
     gain = without.mse_nm2 - state.mse_nm2
     assert gain > 0
-    return reshaped_gain(without, state, study) / gain
+    return reshaped_gain(without, state) / gain
 
 
 @pytest.mark.parametrize("name", ["slope-x-power-1", "curvature-x", "slope-thinning"])
@@ -69,10 +69,11 @@ def test_the_limits_of_a_name_are_those_that_are_written(
     state = SimpleNamespace(
         freed_nm2=np.full(10, 90.0),
         twin=SimpleNamespace(exhausts=lambda name: exhausted, slots=()),
-        without=lambda name, study: SimpleNamespace(freed_nm2=np.full(10, 100.0)),
+        without=lambda name: SimpleNamespace(freed_nm2=np.full(10, 100.0)),
+        study=study,
     )
-    monkeypatch.setattr(checking, "reshaped_gain", lambda without, state, study: reshaped_nm2)
-    one = Check(state, [cause], [], left_nm2, None, study).of(cause)
+    monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: reshaped_nm2)
+    one = Check(state, [cause], [], left_nm2, None).of(cause)
     assert one.judgement.gain_nm2 == pytest.approx(10)
     assert said in one.reason
     assert bool(one.reason) is bool(said)
@@ -102,7 +103,7 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     ]
     large, minor = causes
     assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
-    check = Check(state, causes, [], 0.0, None, study)
+    check = Check(state, causes, [], 0.0, None)
     # Beside a law without a name even a tilt is suspect.
     assert check._larger(minor, without[small]) == "slope-x-power-1"
     monkeypatch.setattr(checking, "get_effect", lambda name: get_effect("slope-thinning"))
