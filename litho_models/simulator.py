@@ -117,7 +117,7 @@ class Simulator(nn.Module, ABC):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model that answers differently for another image size; None for all others."""
+        """The tile of a model whose result depends on the size of the image; None for all others."""
         return None
 
     @abstractmethod
@@ -141,7 +141,7 @@ class Simulator(nn.Module, ABC):
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """The model without what it knows of the microscope; itself where it knows nothing of it."""
+        """The model without its part for the microscope; the model itself if it has none."""
         return self
 
     @property

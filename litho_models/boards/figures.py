@@ -76,7 +76,7 @@ def counted(trials: Iterable[Trial]) -> list[Counted]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """The headline figures; of a failed trial no cause counts as found, and the error as too large."""
+    """The headline figures; in a failed trial no cause counts as found, and its error counts as too large."""
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
     empty = [

@@ -76,7 +76,7 @@ class Planted(Record):
     Attributes:
         names: names in the effects catalogue that are right for it.
         strength: in ``unit``; ``at_limit``: its range ended before the wanted size was reached.
-        rms_nm: what is left of it alone after base, scan terms and registration are refitted without noise.
+        rms_nm: rms that it alone leaves after a refit of base, scan terms and registration without noise.
     """
 
     draw: CauseDraw
@@ -119,7 +119,7 @@ class TrialErrors(Record):
 
     @property
     def ratio(self) -> float | None:
-        """Error with all that was found over that of the true models."""
+        """Ratio of the error with all that was found to that of the true models."""
         return self.after_nm / self.floor_nm if self.floor_nm else None
 
 
@@ -128,7 +128,7 @@ class Found(Record):
 
     Attributes:
         names: its name in the catalogue, then those of effects that look the same.
-        by: what its strength differs by; ``scan`` if every scan has its own, ``all`` if it is the same.
+        by: grouping by which its strength differs; ``scan``: one strength per scan; ``all``: one for all.
         exponents: intervals of its exponent, where it is a power law.
     """
 
@@ -148,7 +148,7 @@ class Answer(Result):
         displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
         before_nm, after_nm: mean absolute error without and with what was found, over the scans that are not
             locked, each by a fit that has not seen it, one offset per scan free. None: not stated.
-        base_values, corrected_values: the Physics model's, without and with what was found.
+        base_values, corrected_values: values of the Physics model, without and with what was found.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/board-answer/1"

@@ -74,7 +74,7 @@ def benchmark(
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
-        seed: of the split, the nuisance blocks and the training.
+        seed: seed of the split, the nuisance blocks and the training.
         workers: local processes that fit and predict; ``dask``: address of a Dask scheduler instead.
 
     Raises:

@@ -11,7 +11,7 @@ _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Which model predicts best, by how much, whether that is more than chance, and what noise leaves.
+    """Which model predicts best, by how much, whether that is more than chance, and how much is noise.
 
     A difference is judged over prints where there are several.
     """

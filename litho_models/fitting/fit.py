@@ -114,7 +114,7 @@ def fit_in_cache(
 ) -> Fitted:
     """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
 
-    Benchmark and loop that train the same model on the same scans find each other's work there.
+    A benchmark and a loop that train the same model on the same scans reuse each other's fits there.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"

@@ -202,7 +202,7 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """By how much a step (p,) lowers the sum of squares behind (p, p), (p,), if the problem is linear."""
+    """By how much a step (p,) lowers the squares of normal equations (p, p), (p,), if these are exact."""
     return float(2 * right @ step - step @ matrix @ step)
 
 

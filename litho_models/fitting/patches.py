@@ -42,7 +42,7 @@ class PatchDataset(Dataset[Patch]):
         per_scan: number of patches from each scan.
         ids: scans to draw from; all that are not locked by default.
         flips: axes along which half of the patches are reversed, at random.
-        seed: of the places and flips.
+        seed: decides places and flips.
 
     Raises:
         InputError: unknown or locked ids, or a patch that is larger than a scan.

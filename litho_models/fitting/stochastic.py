@@ -138,7 +138,7 @@ class _Targets:
 
 
 class _Heights(nn.Module):
-    """Heights of crops for training, as one module: its forward pass is what processes share gradients of.
+    """Heights of crops for training, as one module, because processes share the gradients of one module.
 
     Random crops come with their surroundings (``margin_px``) or are one tile of the model; quadrants are
     images of their own. Layouts and heights are float32 whatever the precision within.

@@ -37,7 +37,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
 
     Args:
         out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
-        size_px: of the layout, one number or (y, x).
+        size_px: side of the layout, or (y, x).
 
     Raises:
         InputError: another suffix; no ``onnx``; a model whose operations the format does not have, or

@@ -49,7 +49,7 @@ def save_frozen(
         name: name in reports; the model's own by default.
         process_effects: effects of the printer that are part of the model, name to parameter values.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); those that follow
-            from the model are found anew.
+            from the model are derived again.
 
     Raises:
         InputError: weights that are not finite or not float32, or unknown card fields.

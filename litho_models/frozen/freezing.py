@@ -28,7 +28,7 @@ def freeze(
         out: folder of the frozen model.
         attribute: the side to which effects of undetermined role are attributed, one for all or by name:
             those of the printer become part of the model, those of the microscope do not. The card says so.
-            ``scan-axis`` is what a base model itself adds along the lines of the scan.
+            ``scan-axis`` is the part of a base model that acts along the lines of the scan.
 
     Raises:
         InputError: no model there, an effect that is not among the undetermined ones, an unknown side, or

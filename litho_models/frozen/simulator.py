@@ -57,7 +57,7 @@ class FrozenSimulator(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model that answers differently for another image size; None for all others."""
+        """The tile of a model whose result depends on the size of the image; None for all others."""
         return self.simulator.tile
 
     @contextmanager

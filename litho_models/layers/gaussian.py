@@ -46,7 +46,7 @@ def gaussian_blur(
             carry gradients.
         pitch_um: sampling of the field, µm.
         edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
-        radius_px: of the kernel on each side; four sigma by default.
+        radius_px: reach of the kernel to each side; four sigma by default.
 
     Raises:
         InputError: a pitch that is not positive, or a field without pixels.

@@ -24,7 +24,7 @@ class Range:
     """Range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
 
     Attributes:
-        name: of the value, with its unit.
+        name: name of the value, with its unit.
         lower, upper: its bounds; an infinite ``upper`` takes the softplus.
     """
 

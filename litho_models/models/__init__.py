@@ -41,7 +41,7 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
     Called in a plug-in, it makes the model known in every process of a command.
 
     Raises:
-        InputError: no name of its own, or one that is taken.
+        InputError: a model without a name of its own, or with one that is taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:

@@ -1,4 +1,4 @@
-"""The authors' weights in our models: their classes are variant ``authors``, their names are read here.
+"""The authors' weights in our models: their classes are variant ``authors``, their names are translated.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -35,7 +35,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         fields: config fields of the model (geometry).
 
     Raises:
-        InputError: weights of no class of theirs, or some that are missing, unknown or of another shape.
+        InputError: weights of none of their classes, or some that are missing, unknown or of another shape.
     """
     if not isinstance(weights, Mapping):
         hint = "torch.load reads their file"

@@ -84,7 +84,7 @@ def illuminate(
     Technol. 12, 1271 (1975)); a third between them.
 
     Args:
-        pattern: what is written; ``spots``: share and standard deviation (µm) of each; ``pitch_um``: of it.
+        pattern: what is written, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each.
         reach_px: at least the widest reach of the spots.
     """
     total = torch.zeros(())

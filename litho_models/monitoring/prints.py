@@ -18,7 +18,7 @@ class Figure(NamedTuple):
     """A figure that is watched.
 
     ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %. ``weight``:
-    its part of the rate of false alarms; what is promised about steps is promised for the gain.
+    its part of the rate of false alarms; the promise about steps is made for the gain.
     """
 
     name: str
@@ -51,7 +51,7 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """One value per print in printing order, the mean over its scans, ``counts`` of them; (n,) each."""
+    """One value per print in printing order, the mean over its ``counts`` scans; (n,) each."""
 
     names: list[str]
     values: np.ndarray
@@ -74,7 +74,7 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Variance of the value of a print with so many scans, in units of a usual one; (n,)."""
+        """Variance of a print's value by its number of scans, relative to that of a usual print; (n,)."""
         if self.within is None:
             return np.ones(len(counts))
         variance = self.between + self.within / counts
@@ -101,8 +101,8 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Mean and spread over prints, two at least; variance components by one-way analysis of variance.
 
-    A print with one scan varies more than one with four. Scans of one print tell the part of the scans from
-    that of the print; a negative variance between prints counts as 0.
+    A print with one scan varies more than one with four. Prints with several scans tell how much of it
+    comes from the scans; a negative variance between prints counts as 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)

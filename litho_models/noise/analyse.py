@@ -40,7 +40,7 @@ def analyse_noise(
             ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold;
             several of one kind are taken as an ensemble.
         model: which model of the benchmarks; their best one by default.
-        seed: of the pixels drawn.
+        seed: decides which pixels are drawn.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.

@@ -45,7 +45,7 @@ _MEANS = ("nll", "crps_nm", "ence", "ause")
 class ScanCalibration(Record):
     """One scan: likelihood and CRPS (nm, lower is better), coverage at the levels stated, rms of r/σ.
 
-    ``factor_90`` is what the scale has to be multiplied by for 90 % of this scan's pixels to be covered;
+    ``factor_90``: factor on the scale with which 90 % of this scan's pixels are covered;
     ``ence`` and ``ause`` are shares (see ``spread_scores``), None in older result files.
     """
 

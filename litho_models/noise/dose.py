@@ -72,8 +72,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     """Judge the doses of the scans that carry one; notes say what is not judged, and why.
 
     A dose without three levels that have areas wide enough to measure on is left out; fewer than two doses
-    make no matrix. Recommended is, among the doses that lose the fewest steps at either end, the one whose
-    height comes nearest to the nominal one.
+    make no matrix. The recommended dose is, among those that lose the fewest steps at either end, the one
+    whose height comes nearest to the nominal one.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:

@@ -39,7 +39,7 @@ class Tails:
 
     @property
     def sd(self) -> float:
-        """Standard deviation over the scale; more than two degrees of freedom."""
+        """Standard deviation over the scale; it takes more than two degrees of freedom."""
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:

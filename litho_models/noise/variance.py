@@ -13,7 +13,7 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
 
-# What may matter, each a map over the scan; the slope also squared, the radius also to the fourth power.
+# Maps that σ may depend on; the slope is also taken squared, the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
 # Linear between the knots: rare levels at both ends are twice as rough as the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
@@ -40,7 +40,7 @@ class VarianceModel(Record):
 
     Level on 0 ... 1 of the range, linear between knots; slope of the blurred layout (height over
     length); distance to the next change of level, at most 2 µm, in units of that; radius from the field's
-    centre in units of half its diagonal. ``freedom``: of Student's t, whose scale s is; None for a Gaussian.
+    centre in units of half its diagonal. ``freedom``: of Student's t with scale s; None for a Gaussian.
     """
 
     covariates: list[str]

@@ -56,7 +56,7 @@ def measured_predictions(
 
 
 def _start_of_peak(device: str) -> int | None:
-    """Bytes in use, from which the peak counts anew; None where the peak cannot be reset."""
+    """Bytes in use, from which the peak is counted again; None where the peak cannot be reset."""
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()

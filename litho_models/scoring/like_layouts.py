@@ -41,7 +41,7 @@ class LikePixels(NamedTuple):
         the commoner ones that become their partners.
 
         Args:
-            residuals: of each scan, (ny, nx); the unit of the result, squared.
+            residuals: one map per scan, (ny, nx); the result is in their unit squared.
         """
         value = np.empty(len(self.owner))
         for number, residual in enumerate(residuals):
@@ -55,12 +55,12 @@ class LikePixels(NamedTuple):
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
     """Draw pixels and find for each those of other scans whose layout surroundings are most like its own.
 
-    Scans of different doses differ where their layouts do not: only prints of one dose are compared.
+    Scans of different doses differ even where layouts are alike: only prints of one dose are compared.
 
     Args:
         scans: at least three of one dose, with layouts that vary; otherwise the result is None.
         scored: bool (ny, nx), which pixels count.
-        seed: of the pixels drawn.
+        seed: decides which pixels are drawn.
     """
     from scipy.spatial import cKDTree
 

@@ -35,9 +35,9 @@ class Metric(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Metrics that one function gives together, in this order, and what they are, in a sentence.
+    """Metrics that one function returns together, in this order, and a sentence that explains them.
 
-    ``instrument``: the kind whose scans have them; all, if empty.
+    ``instrument``: the kind whose scans have them; all kinds if empty.
     """
 
     metrics: tuple[Metric, ...]

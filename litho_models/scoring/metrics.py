@@ -108,5 +108,5 @@ def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> 
 
 
 def phase_waves(height_error_um: float) -> float:
-    """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
+    """Phase error, in waves, of light that passes an element whose height is wrong by ``height_error_um``."""
     return height_error_um * INDEX_STEP / WAVELENGTH_UM

@@ -1,4 +1,4 @@
-"""What is scored and what comes out: a prediction, the scores of a scan and of a model, scores in pairs."""
+"""Records of scoring: a prediction, the scores of a scan and of a model, and two models' paired scores."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def one_sided_flip_p(values: Array) -> float:
 
 
 def smallest_flip_p(count: int) -> float:
-    """Smallest two-sided sign-flip p that so many scans or prints can have: all signs, or their mirror image.
+    """Smallest two-sided sign-flip p of this many scans or prints: two of all combinations of signs.
 
     Six prints cannot go below 2 / 2^6 = 0.031, however large the difference.
     """
