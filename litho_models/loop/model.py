@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import vector_to_parameters
 
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Frame
@@ -187,11 +188,8 @@ class Twin:
         """The base at its numbers: a copy of its own, where it has any."""
         if not self.own:
             return self.base
-        base, at = copy.deepcopy(self.base), 0
-        for parameter in _parameters(base):
-            values = self.vector[at : at + parameter.numel()]
-            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
-            at += parameter.numel()
+        base = copy.deepcopy(self.base)
+        vector_to_parameters(torch.as_tensor(self.numbers, dtype=torch.float32), _parameters(base))
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
