@@ -145,10 +145,10 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     named = f" ({', '.join(listed)})" if listed else ""
     median = np.median([over_idle(row) for row in rows])
     return (
-        f"Of {len(rows)} corrections {len(worse)} print more than 5 % worse than the better of nominal "
-        f"heights and best affine{named}. In the median a correction has {median:.2f} × the error of that, "
-        f"and a blaze {np.median(blazes):.2f} × that of the best affine. {len(inside)} of {len(rows)} prints "
-        "lie within the stated width."
+        f"Of {len(rows)} corrections {len(worse)} print more than 5 % worse than nominal heights or the "
+        f"best affine, whichever is better{named}. In the median a correction has {median:.2f} × the error "
+        f"of the better one, and a blaze {np.median(blazes):.2f} × the error of the best affine. "
+        f"{len(inside)} of {len(rows)} prints have an error in the stated range."
     )
 
 

@@ -72,9 +72,9 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"figure of this table; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. "
         "Per-scan terms are fitted on pixels that are not scored. The shared background is what levelling "
         "leaves in every map: five numbers from the training scans, added to predictions of measured maps "
-        "and to no design. The noise is an upper estimate ([how](../../noise.md)), its intervals are over "
+        "and to no design. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
         "prints. "
-        f"At least what an error has above it can still be won: at k = 1 and 7 {_above(benchmark, floor)}.",
+        f"At least the part of an error above it can be removed: at k = 1 and 7 {_above(benchmark, floor)}.",
     )
 
 
@@ -96,10 +96,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         ("model", "parameters", "zero height free (k = 1)", "offset, gain, tilt and bow free (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds, each predicted by models that were not trained on it, with the smooth background of their "
+        "folds, each predicted by models that were not trained on it, plus the smooth background of their "
         "training scans. k: terms fitted to each scan, on pixels that are not scored. Intervals: 95 %, over "
-        "scans; in the last row but one over the 6 prints. That row is an upper estimate: it counts what "
-        "place, field and print share as noise.",
+        "scans; in the last row but one over the 6 prints. That row is an upper estimate: it counts as noise "
+        "what place, field and print share.",
     )
 
 

@@ -125,8 +125,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         heads,
         rows,
         f"{size_px} × {size_px} px, float32, {record['device']}, {record['threads']} thread, seconds of "
-        f"the processor, median of {REPEATS}, torch {record['versions']['torch']}. Training is by the clock, "
-        "on a machine with other work.",
+        f"the processor, median of {REPEATS}, torch {record['versions']['torch']}. Training is wall-clock "
+        "time, on a machine with other work.",
     )
 
 

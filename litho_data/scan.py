@@ -1,4 +1,4 @@
-"""One height map as an instrument recorded it, with everything that the file says about it."""
+"""One height map as an instrument recorded it, with all that the file says about it."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -27,7 +27,7 @@ class Scan:
         header: everything else that the file says, as strings.
         source: path of the file.
         format: name of the reader that read it.
-        notes: what to know before the heights are trusted.
+        notes: warnings for whoever uses the heights.
 
     Raises:
         InputError: not a map of at least 2 x 2 pixels, no finite height at all, a mask of another

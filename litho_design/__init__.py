@@ -1,4 +1,4 @@
-"""Diffractive optics designed through a frozen model of the printer, scored, and exported for it."""
+"""Diffractive optics designed through a frozen model of the printer, scored, and exported as its files."""
 
 from typing import TYPE_CHECKING
 

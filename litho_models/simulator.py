@@ -22,17 +22,17 @@ _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Spot (standard deviation, µm) to which default lengths belong, for layouts of a pitch.
+    """Spot (standard deviation, µm) from which default lengths follow, for layouts of a pitch.
 
-    That of the first printer, unless it would be less than half a pixel or more than ten: then the printer is
-    another one, and layouts are taken to resolve its spot as they did that of the first, by two pixels.
+    It is that of the first printer, unless that is narrower than half a pixel or wider than ten: then the
+    printer is another one, and its spot is taken to be two pixels wide, as that of the first printer was.
     """
     low, high = _RESOLVED_PX
     return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """The fields of a config that are lengths, with their defaults or what is ``set_``, for a pitch."""
+    """The lengths of a config, from ``set_`` or the defaults, scaled to a pitch; none at scale 1."""
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
         return {}
@@ -90,7 +90,7 @@ class Tile(NamedTuple):
 class Simulator(nn.Module, ABC):
     """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
 
-    A subclass states ``interior``; what it returns may depend on the layout within ``reach_px`` of a
+    A subclass implements ``interior``; what it returns may depend on the layout within ``reach_px`` of a
     pixel and on nothing else, so that a crop with that margin predicts what the whole field does.
     """
 
@@ -104,7 +104,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """As of every module; what the config fixes is not trained."""
+        """As in every module, except that what the config fixes is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)
@@ -117,14 +117,14 @@ class Simulator(nn.Module, ABC):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model that answers differently for another image size; None for all others."""
+        """The tile of a model whose result depends on the size of the image; None for all others."""
         return None
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
         """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm.
 
-        Without a receptive radius it is the image as a whole, or one tile: the same size.
+        Without a receptive radius the layout is a whole image, or one tile, and the size stays the same.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
@@ -135,13 +135,13 @@ class Simulator(nn.Module, ABC):
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
         """Height of the whole field without its outermost ``border_px``, less than half of it, µm.
 
-        A model without a receptive radius overrides it where it can leave out the border's cost; of any
-        other ``predict_inside`` computes what is needed.
+        A model without a receptive radius overrides this if it can save the cost of the border; for any
+        other, ``predict_inside`` computes only what is needed.
         """
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """The model without what it knows of the microscope; itself where it knows nothing of it."""
+        """The model without its part for the microscope; the model itself if it has none."""
         return self
 
     @property
@@ -151,7 +151,7 @@ class Simulator(nn.Module, ABC):
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Values that stand on a bound of their range, and that bound."""
+        """Values that have reached a bound of their range, and that bound."""
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
         return {name: bound for name, bound in bounds.items() if bound is not None}
@@ -173,7 +173,7 @@ class Simulator(nn.Module, ABC):
 
 
 def is_small(model: nn.Module) -> bool:
-    """Few enough trainable numbers for a column of derivatives each, at most ``SMALL_PARAMETERS``.
+    """Whether trainable numbers are few (``SMALL_PARAMETERS``) enough for a column of derivatives each.
 
     A small model is fitted by least squares (unless the recipe is the paper's), and in the loop together with
     the effects; any other is trained by stochastic gradient, and the loop takes it as it is.

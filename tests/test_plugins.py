@@ -132,7 +132,7 @@ def test_a_plugin_that_cannot_be_loaded_is_one_line(tmp_path: Path, unknown: Non
     failing.write_text("1 / 0")
     taken.write_text("")
     wrong = {tmp_path / "none.py": "none.py", tmp_path: "a file of Python"}
-    for file, said in {**wrong, failing: "ZeroDivisionError", taken: "a name of its own"}.items():
+    for file, said in {**wrong, failing: "ZeroDivisionError", taken: "an unused name"}.items():
         with pytest.raises(InputError, match=said):
             plugins.load_plugins([file])
     assert not plugins.plugin_files()

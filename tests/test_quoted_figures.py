@@ -227,3 +227,26 @@ def test_the_page_on_training_quotes_the_recipes():
     fast = DOCS / "results" / "neural-lithography" / "benchmark_paper_0.json"
     pbl, fno, physics = (error_nm(fast, one) for one in ("pbl", "fno", "physics"))
     assert f"{pbl:.2f}, {fno:.2f} and {physics:.2f} nm" in text
+
+
+def test_the_page_on_blind_boards_has_the_entries_as_they_were_judged():
+    boards = [
+        json.loads((DOCS / "results" / "blind-board" / f"{name}.json").read_text("utf-8"))
+        for name in ("plain_loop", "close_loop")
+    ]
+
+    def cell(trial: dict[str, Any] | None) -> str:
+        if trial is None:
+            return "not run yet"
+        false = [f"false name `{name}`" for name in trial["false_names"]]
+        ratio = trial["errors"]["after_nm"] / trial["errors"]["floor_nm"]
+        return ", ".join([*(one["verdict"] for one in trial["outcomes"]), *false, f"{ratio:.2f} ×"])
+
+    rows = []
+    for trial in boards[0]["trials"]:
+        number = trial["draw"]["number"]
+        cells = [next((t for t in one["trials"] if t["draw"]["number"] == number), None) for one in boards]
+        hidden = ", ".join(f"`{one['name']}`" for one in trial["draw"]["causes"]) or "nothing"
+        rows.append(f"| {hidden} ({trial['draw']['kind']}) | {' | '.join(map(cell, cells))} |")
+    page = (DOCS / "blind_board.md").read_text("utf-8")
+    assert "\n".join(["| hidden | plain_loop.py | close-loop |", "|---|---|---|", *rows]) in page

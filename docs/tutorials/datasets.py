@@ -1,9 +1,10 @@
 # %% [markdown]
 # # From scans to a dataset
 #
-# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset in
-# which every scan lies on its layout, pixel by pixel, and which knows where each of its numbers comes from. Here
-# the scans come from the built-in virtual fab; for your own, only the first step differs ([how](../own_data.md)).
+# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset
+# in which every scan lies on its layout, pixel by pixel, and which records where each number comes from. Here
+# the scans come from the built-in virtual fab; for your own, only the first step differs
+# ([how](../own_data.md)).
 
 # %%
 import litho_data
@@ -30,8 +31,8 @@ result = litho_data.build_dataset(card, "prints.zarr")
 print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
 
 # %% [markdown]
-# The quality table tells how well each scan found its layout. `ncc_after` is the correlation of height and layout
-# once registered, `tre_median_nm` the distance between matching details that were kept out of the fit
+# The quality table tells how well each scan fits its layout. `ncc_after` is the correlation of height and
+# layout once registered, `tre_median_nm` the distance between matching details that were kept out of the fit
 # ([what is good](../registration.md)).
 
 # %%
@@ -65,8 +66,8 @@ for axes, (title, (image, scale)) in zip(figure.subplots(1, 3), panels.items(), 
 figure
 
 # %% [markdown]
-# The print has less contrast than its layout and rounds it off: that is what a model of the printer has to learn. Before you
-# pass the dataset on, make sure that nothing has changed since it was built:
+# The print is flatter and rounder than its layout: a model of the printer has to learn that. Before you pass
+# the dataset on, make sure that nothing has changed since it was built:
 
 # %%
 checked = litho_data.verify("prints.zarr")

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Twelve pictures, ten lines each
 #
-# Every picture is what the lines above it draw, in one run from top to bottom. First how pictures are shown, and
-# four simulated prints that the others use; yours come from [your own scans](../own_data.md).
+# The lines above each picture draw it; the page runs once from top to bottom. First come a function that
+# shows pictures and four simulated prints; for yours, see [your own scans](../own_data.md).
 
 # %%
 import litho_data
@@ -36,7 +36,7 @@ layouts = {
 show(layouts)
 
 # %% [markdown]
-# ## 2. What a microscope gives back: [a raw scan](../readers.md), and it [levelled](../levelling.md)
+# ## 2. What a microscope gives back: [a raw scan](../readers.md), then [levelled](../levelling.md)
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -108,7 +108,7 @@ prints = {name: model(layout_um)[0, 0].numpy() for name, model in models.items()
 show(prints, vmin=0, vmax=1.2)
 
 # %% [markdown]
-# ## 8. What a model misses: [residuals](../evaluation.md), of a model of another printer
+# ## 8. What a model misses: [residuals](../evaluation.md) of models of another printer
 
 # %%
 missed = {name: first.height_um - own for name, own in prints.items()}
@@ -144,7 +144,7 @@ printed_um = design.printed_um(litho_design.load_printer("zoo:physics", settings
 show({"layout": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
 
 # %% [markdown]
-# ## 11. A lens [in a program of your own](../element.md): a focus at 20 µm, by the wave behind its print
+# ## 11. A lens [in a program of your own](../element.md): a focus at 20 µm, from the wave behind its print
 
 # %%
 element = litho_design.Element("zoo:physics", {"size_px": 160, "cell_um": 0.1})

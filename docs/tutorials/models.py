@@ -41,7 +41,7 @@ floor = result.noise_floor
 print(f"noise: {floor.mae_at('offset'):.2f} nm ({floor.kind})")
 
 # %% [markdown]
-# The same as bars, one colour a model, as in `benchmark/report.html`, which has all figures and tables:
+# The same as bars, one colour per model, as in `benchmark/report.html`, which has all figures and tables:
 
 # %%
 from litho_models.evaluation.plots import error_bars
@@ -49,8 +49,8 @@ from litho_models.evaluation.plots import error_bars
 error_bars(result.scores, floor.mae_at("offset"), paper_line=False)
 
 # %% [markdown]
-# Train the one you chose on all scans but the locked ones, and freeze it: a folder with weights and a card that
-# designs, and other people, can load.
+# Train the one you chose on all scans but the locked ones, and freeze it: a folder with weights and a card,
+# for designs and other people to load.
 
 # %%
 litho_models.train("prints.zarr", "physics", "run")

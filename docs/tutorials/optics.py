@@ -16,8 +16,8 @@ designs = {
 }
 
 # %% [markdown]
-# `without` was designed for a perfect printer, `with` through a model trained on measured prints. What each expects
-# of itself says nothing yet. Let a model that had no part in either print both, and look at the image behind them:
+# `without` was designed for a perfect printer, `with` through a model trained on measured prints. A design's
+# own prediction proves nothing. Let a model that had no part in either print both, and look at the images:
 
 # %%
 judged = {
@@ -46,9 +46,9 @@ for axes, (title, image) in zip(figure.subplots(1, 3), images.items(), strict=Tr
 figure
 
 # %% [markdown]
-# Both are predictions. The one that counts is a photograph of the print; `litho_design.score` takes it, or an AFM
-# scan, in place of the model. To print it, export the layout: an image of levels, with a sidecar that gives heights
-# and size and reads it back.
+# Both are predictions. What counts is a photograph of the print; `litho_design.score` takes it, or an AFM
+# scan, in place of the model. To print it, export the layout: an image of levels, with a sidecar that gives
+# heights and size and reads it back.
 
 # %%
 print(litho_design.export("with", "png16", "to-printer").name)

@@ -18,7 +18,7 @@ from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 
-# Of a value that is shown.
+# Longest value that a message shows, characters.
 _LONGEST = 80
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
@@ -48,14 +48,15 @@ def with_tip(card: Card, tip: float | str) -> Card:
     """The card with another ``process.tip``.
 
     Raises:
-        InputError: neither a positive number nor ``blind``, or micrographs, which no tip has made.
+        InputError: a tip that is neither a positive number nor ``blind``, or a card of micrographs, which
+            have no tip.
     """
     if card.scan.instrument == "sem":
         raise InputError("tip", got="micrographs", wanted="scans of an atomic force microscope")
     try:
         value = tip if tip == "blind" else float(tip)
         process = Process.model_validate({**card.process.model_dump(), "tip": value})
-    except ValueError as error:  # pydantic's is one
+    except ValueError as error:  # pydantic's error is a ValueError
         raise InputError("tip", got=repr(tip), wanted="a radius in µm, or blind") from error
     return card.model_copy(update={"process": process})
 
@@ -94,7 +95,7 @@ def _inside(value: str) -> str:
     parts = PurePosixPath(value.replace("\\", "/")).parts
     leaves = not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value)
     if leaves or not value.isprintable():
-        raise ValueError("wanted a path that stays inside the data folder, of characters that can be read")
+        raise ValueError("wanted a path inside the data folder, in printable characters")
     return value
 
 
@@ -120,8 +121,9 @@ class LayoutFiles(Record):
     """What was sent to the printer.
 
     ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
-    255 / (levels - 1) where white is the highest level. ``average_px``: the files are pictures in black and
-    white, of which squares of so many pixels a side become one, whose level counts the white ones.
+    255 / (levels - 1) where white is the highest level. ``average_px``: the files are black-and-white
+    pictures; each square of this many pixels a side becomes one pixel of the layout, whose level is the
+    number of white pixels in the square.
     """
 
     files: FilePatterns
@@ -143,11 +145,11 @@ class LayoutFiles(Record):
 class ScanFiles(Record):
     """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it.
 
-    ``instrument``: what kind of microscope. Of ``sem``, a scanning electron microscope, the files are
-    pictures of a film of the layout's full height, whose edges are measured.
+    ``instrument``: the kind of microscope. The files of ``sem``, a scanning electron microscope, are pictures
+    of a film of the layout's full height; the build measures the edges of the film.
 
-    ``levelled``: whether the heights are to be taken as they are in the files.
-    ``missing``: numbers and words that mark pixels which were not measured; an empty list says that there are
+    ``levelled``: whether the build takes the heights from the files without levelling them.
+    ``missing``: numbers and words that mark pixels without a measurement; an empty list says that there are
     none.
     """
 
@@ -175,8 +177,8 @@ class ScanFiles(Record):
 class Process(Record):
     """How raw scans become heights on the layout grid: a levelling recipe file, a registration model, a tip.
 
-    Without ``level`` the layout-aware plane is taken out of scans that are not levelled yet. ``tip`` is the
-    radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
+    Without ``level``, the layout-aware plane is subtracted from scans that are not level yet. ``tip`` is the
+    radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
     """
 
     level: InsidePath | None = None
@@ -192,7 +194,7 @@ class Ids(Record):
 
 
 class Standard(Record):
-    """A scan of something whose size is known; how to read it is that of the scans unless stated here."""
+    """A scan of something of known size; it is read like the card's scans unless stated here."""
 
     file: InsidePath
     uncertainty_um: Uncertainty
@@ -203,20 +205,20 @@ class Standard(Record):
 
 
 class Grating(Standard):
-    """A grating along an axis; a square one serves both."""
+    """A grating along one axis; a square grating serves both axes."""
 
     period_um: Length
 
 
 class Step(Standard):
-    """A step, ridge or groove; ``axis`` is the one that its edges lie across."""
+    """A step, ridge or groove; its edges run across ``axis``."""
 
     height_um: Length
     axis: Literal["x", "y"] = "x"
 
 
 class Calibration(Record):
-    """What tells the scales of the microscope: gratings along x and y, a step."""
+    """The standards that give the scales of the microscope: gratings along x and y, a step."""
 
     x: Grating | None = None
     y: Grating | None = None
@@ -230,7 +232,7 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """How the printer wrote a field; what is missing is assumed, and labelled as an assumption.
+    """How the printer wrote a field; missing facts are assumed, and labelled as assumptions.
 
     ``surround``: what lies around a printed field, the bare substrate or more of the print.
     """
@@ -241,14 +243,14 @@ class Write(Record):
 
 
 class KnownGrating(Record):
-    """The grating that scans of the use ``grating`` show: period along both axes, from its certificate."""
+    """The grating in scans whose use is ``grating``: its certified period along both axes."""
 
     period_um: Length
     uncertainty_um: Uncertainty = 0.0
 
 
 class Planned(Record):
-    """Prints that were planned: the hash of the dataset whose open questions they are to decide."""
+    """Planned prints: the hash of the dataset whose open questions they should answer."""
 
     dataset_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -281,7 +283,7 @@ class Card(Record):
     def _of_one_instrument(self) -> Self:
         heights = (self.process.level, self.process.tip, self.calibration, self.grating)
         if self.scan.instrument == "sem" and any(one is not None for one in heights):
-            raise ValueError("wanted no levelling, tip, calibration or grating of micrographs")
+            raise ValueError("wanted no levelling, tip, calibration or grating: micrographs have none")
         return self
 
 
@@ -293,7 +295,7 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":
-        # The message of our own validators; for a table it already names the key.
+        # A message of our own validators; for a table it already names the key.
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
         return InputError(f"{what}: {key}{shown}: {cause}")

@@ -16,7 +16,7 @@ from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, rea
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
-# An expression of a card is matched in a process of its own, for so long at most.
+# Longest time that a card's expression may take to match, in a process of its own.
 _LONGEST_S = 10.0
 _MATCH = """
 import json, re, sys
@@ -29,9 +29,9 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 class PrintedField:
     """One field to build: its files and what the card says about it.
 
-    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` what it says of the
-    file in place of the card, ``full_scale_um`` the height of the largest integer of an image scan;
-    ``layout`` may be None for a reference scan only (``use`` not dataset).
+    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` the reading options
+    that the table gives instead of the card, ``full_scale_um`` the height of the largest integer of an image
+    scan. ``layout`` may be None only for a reference scan (``use`` not dataset).
     """
 
     id: str
@@ -47,7 +47,7 @@ class PrintedField:
 
 @dataclass(frozen=True)
 class LeftAside:
-    """Files that are not used: an id with only one of its files (``unpaired``), or one that is refused."""
+    """Files that are not used: of an id with only one of its files (``unpaired``), or of a refused id."""
 
     id: str
     files: tuple[Path, ...]
@@ -194,7 +194,7 @@ def _refusal(
 
 
 def leads_out(files: tuple[Path, ...], folder: Path) -> str:
-    """Why files that are links cannot be used: what lies outside is not what the card is about."""
+    """Why links cannot be used that lead out of the data folder, which is all that the card describes."""
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
 
@@ -211,7 +211,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
-    """Facts that the card does not state, which are assumed for the effects that need them."""
+    """Facts that the card does not state and that are assumed for the effects that need them."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")
@@ -227,8 +227,8 @@ def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[st
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
     """The group ``print`` of the expression for each whole id, None where it does not match.
 
-    Without an expression every id is a print of its own. Nothing stops an expression that tries all ways to
-    repeat repetitions, so one with any repetition runs in a process of its own.
+    Without an expression every id is a print of its own. Matching nested repetitions can take for ever and
+    cannot be interrupted, so an expression with any repetition runs in a process of its own.
 
     Raises:
         InputError: no result after 10 s.
@@ -251,6 +251,6 @@ def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
         raise InputError(
             f"[ids] print = {pattern!r}",
             got=f"no result after {_LONGEST_S:.0f} s",
-            wanted="an expression without repetitions inside repetitions",
+            wanted="an expression without nested repetitions",
         ) from error
     return json.loads(done.stdout)

@@ -20,7 +20,7 @@ from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
 READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
-"""What the table may say about single scans, in place of the card's ``[scan]``."""
+"""What the table may say about single scans; it replaces the card's ``[scan]``."""
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
 _NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")
 _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
@@ -29,11 +29,12 @@ _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 def read_table(path: Path) -> dict[str, dict[str, str]]:
     """Rows of a card's CSV table by id, without empty cells; all other cells have been checked.
 
-    Cells are apart by commas, semicolons or tabs, the text may be UTF-16, and where commas do not separate
-    cells they may be decimal commas: what spreadsheets write in any language.
+    It reads what spreadsheets write in any language: cells separated by commas, semicolons or tabs, text that
+    may be UTF-16, and decimal commas where commas do not separate cells.
 
     Raises:
-        InputError: unreadable, an unknown column, an id that is no plain name, or a cell of the wrong kind.
+        InputError: an unreadable file, an unknown column, an id that is no plain name, or a cell of the wrong
+            kind.
     """
     try:
         lines = read_text(path).splitlines()
@@ -93,7 +94,7 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
 
 
 def size_of(text: str) -> YX | None:
-    """(y, x) of a cell with one side or with both, apart by ``x``; None if it is none."""
+    """(y, x) from a cell with one side, or both sides separated by ``x``; None if it has neither."""
     sides = [one.strip() for one in re.split("[x×]", text)]
     if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):
         return None

@@ -67,7 +67,7 @@ def build(
         str | None,
         typer.Option(
             metavar="UM|blind",
-            help="radius of the tip, or blind to find it; pixels that it may not have touched are not valid",
+            help="radius of the tip, or blind to find it; pixels that it may not have touched become invalid",
         ),
     ] = None,
 ) -> None:

@@ -86,7 +86,7 @@ def simulate(
     layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
     plan: Annotated[
         Path | None,
-        option("print and scan the plan in this folder (litho-models next-print), beside --fab"),
+        option("print and scan the plan in this folder (litho-models next-print); needs --fab"),
     ] = None,
     fab: Annotated[
         Path | None,
@@ -138,13 +138,13 @@ def simulate(
             or knob
             or any(value is not None for value in (count, size_px, write_field_um))
         ):
-            wanted = "only --out and --seed: plan and fab have the rest"
+            wanted = "only --out and --seed: plan and fab set the rest"
             raise InputError("options beside --plan", wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
         return
     if layouts is not None and any(value is not None for value in (count, size_px, write_field_um)):
-        wanted = "no --count, --size-px or --write-field-um: the card's layouts have them"
+        wanted = "no --count, --size-px or --write-field-um: the card's layouts set them"
         raise InputError("options beside --layouts", wanted=wanted)
     if preset in FILM_PRINTERS:
         knobs = film_knobs(knob or ())

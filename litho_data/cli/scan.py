@@ -35,13 +35,13 @@ _READING: dict[str, Any] = {
     ],
     "missing": Annotated[
         list[str] | None,
-        option("number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
+        option("number or word that marks pixels without a measurement, e.g. -9999; repeatable"),
     ],
 }
 
 
 def reads_scans(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command options that say how a scan is read; it gets them as ``how``, for ``read_scan``."""
+    """Give a command the options that say how to read a scan; it gets them as ``how``, for ``read_scan``."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:

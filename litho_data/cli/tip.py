@@ -26,7 +26,7 @@ def tip(
         option("folder for NAME.certain.npy (true where the tip touched) and NAME.surface.gsf"),
     ] = None,
 ) -> None:
-    """Estimate the radius of the tip, or the most that it can be, and where it did not touch.
+    """Estimate the radius of the tip, or its upper limit, and the pixels that it may not have touched.
 
     The surface in --maps is the highest that explains the image.
 

@@ -17,12 +17,12 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.plugins import OPTION, load_plugins, without_plugins
 from litho_data.foundation.run_facts import running_command
 
-# Typer does not export it under a name of its own: what its errors of usage are derived from.
+# The base class of Typer's usage errors, which Typer does not export.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """An option of a command: what it is, its names where these are others, and what else typer takes."""
+    """An option of a command: its help, its names if not the default ones, and further arguments of typer."""
     return typer.Option(*names, help=help, **more)
 
 
@@ -71,15 +71,15 @@ HelpAll = Annotated[
 
 
 def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
-    """Give a function that takes ``**values`` the signature that typer is to see."""
-    # Typer reads both.
+    """Give a function that takes ``**values`` the signature that typer should see."""
+    # Typer reads signature and annotations.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run
 
 
 def keyword(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
-    """A parameter of a command that typer makes an option of."""
+    """A parameter of a command that typer turns into an option."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -89,7 +89,7 @@ def takes_more(
     more: Sequence[inspect.Parameter],
     without: str = "",
 ) -> Callable[..., None]:
-    """Give ``run``, which wraps a command, the parameters of the command but ``without``, and more."""
+    """Give ``run``, which wraps a command, the command's parameters except ``without``, plus ``more``."""
     own = inspect.signature(command, eval_str=True).parameters.values()
     kept = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own if one.name != without]
     return takes(run, [*kept, *more])
@@ -112,10 +112,10 @@ def new_app(help_text: str) -> typer.Typer:
     def options(
         context: typer.Context,
         version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
-        # Taken off the words by run_app, before there is anything to parse: here for the help.
+        # run_app removes it from the command line before parsing; declared here for the help.
         plugin: Annotated[
             list[str] | None,
-            option("Load a Python file that registers something; goes with every command.", OPTION),
+            option("Load a Python file that registers something; works with every command.", OPTION),
         ] = None,
     ) -> None:
         if version:
@@ -127,21 +127,21 @@ def new_app(help_text: str) -> typer.Typer:
             typer.echo(context.get_help())
             raise typer.Exit(2)
 
-    # Without invoke_without_command, --version alone would be asked for a command.
+    # Without invoke_without_command, --version alone would fail for want of a command.
     return typer.Typer(
         help=help_text,
         callback=options,
         invoke_without_command=True,
         pretty_exceptions_enable=False,
-        # Boxes leave a third of a line of 80 characters to what an option does.
+        # Boxes would leave only a third of an 80-character line to the help of an option.
         rich_markup_mode=None,
     )
 
 
 def run_app(app: typer.Typer, name: str) -> None:
-    """Run a typer application; what a machine or an input does not allow is one line and exit code 2.
+    """Run a typer application; an error of the input or of the system prints one line and exits with code 2.
 
-    Everything else that is raised is a defect of this project, with a traceback.
+    Any other exception is a defect of this project and shows its traceback.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
@@ -153,7 +153,7 @@ def run_app(app: typer.Typer, name: str) -> None:
             load_plugins(files)
             code = app(words, prog_name=name, standalone_mode=False)
     except BrokenPipeError:
-        # Who read the output, such as `head`, has had enough; Python would complain when it ends.
+        # The reader of the output, such as `head`, has closed it; Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except UsageError as error:
@@ -170,33 +170,33 @@ def run_app(app: typer.Typer, name: str) -> None:
 
 
 def _not_allowed(error: Exception) -> InputError | None:
-    """What a machine does not allow, in words; None for a defect of this project."""
-    # PyTorch and safetensors have errors of their own for it.
+    """What the system or the input did not allow, in words; None for a defect of this project."""
+    # PyTorch and safetensors raise errors of their own for it.
     text = str(error)
     if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
         got = text.partition("\n")[0][:_LONGEST]
         return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
     if isinstance(error, OSError):
         what = f"cannot use {error.filename}" if error.filename else "the system refuses"
-        # NumPy does not say why it has written less.
+        # NumPy does not say why it wrote less than all.
         code = errno.ENOSPC if text.endswith(" written") else error.errno or 0
         return InputError(what, got=error, hint=_WAYS_OUT.get(code, _AGAIN))
     if "Symlink loop" in text:
         return InputError("a link that leads to itself", got=text.partition("'")[2].rstrip("'"))
     if isinstance(error, RecursionError):
-        return InputError("input", got="parts within parts, too deep", wanted="a flatter file")
+        return InputError("input", got="parts nested too deep", wanted="a flatter file")
     if isinstance(error, OverflowError):
-        return InputError("a number of the input", got=error, wanted="one of a size that can be")
+        return InputError("number in the input", got=error, wanted="a number of a possible size")
     return None
 
 
 def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
-    """What typer has to say about words that it cannot parse, as this project says it.
+    """Typer's complaint about a command line that it cannot parse, in this project's words.
 
     Args:
         error: a ``UsageError``.
-        name: of the program.
-        words: its arguments.
+        name: name of the program.
+        words: arguments of the program.
     """
     command = error.ctx.command_path if error.ctx else " ".join([name, *words[:1]])
     parameter = getattr(error, "param", None)
@@ -220,7 +220,7 @@ def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
 
 
 def _given(options: Sequence[str], words: Sequence[str]) -> str | None:
-    """What stands behind an option on the command line; None for an argument."""
+    """The value that follows an option on the command line; None for an argument."""
     for word, value in zip(words, [*words[1:], None], strict=True):
         name, equals, rest = word.partition("=")
         if name in options:

@@ -12,9 +12,9 @@ from typing import TypeVar
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-# What items take in this time tells what the others will, and what is too short to be told.
+# Shortest time to estimate from, and shortest remaining time that is reported.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-# With what a command takes to start, five seconds.
+# Five seconds, with the time that a command takes to start.
 _SILENT_S = 3.0
 _silent = threading.Event()
 
@@ -26,7 +26,7 @@ def run_script(main: Callable[[], T]) -> T:
 
 
 def given_words() -> list[str]:
-    """What stands behind the program's name on the command line."""
+    """The words after the program's name on the command line."""
     return sys.argv[1:]
 
 
@@ -52,14 +52,14 @@ def progress(
 ) -> Iterator[T]:
     """Iterate with a progress bar on stderr; without one if stderr is no terminal.
 
-    Once it is known how long the rest takes, and it is more than a minute, one line says so. The first items
-    do not tell, as what starts meanwhile is no part of the others, unless they take a minute themselves.
+    If the rest will take more than a minute, one line says how long, as soon as it can be estimated. The
+    first items include start-up, so they do not count for the estimate unless they take a minute themselves.
 
     Args:
         items: what is iterated over; ``what``: what is done with them.
-        total: how many there are, where ``len`` does not tell.
-        estimate_of: how many the estimate is of, by default all of these; 0 for none.
-        at_once: how many are worked on at a time.
+        total: number of items, if ``len`` does not give it.
+        estimate_of: number of items that the estimate covers, by default all; 0 for no estimate.
+        at_once: number of items that are worked on at a time.
     """
     from rich.console import Console
     from rich.progress import track
@@ -80,14 +80,14 @@ def progress(
 
 
 def say(what: str) -> None:
-    """One line on stderr, before the work that it names: whoever waits knows what for."""
+    """Print one line on stderr before the work that it names, so that the user knows what they wait for."""
     _silent.clear()
     print(what, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def never_silent(name: str) -> Iterator[None]:
-    """Say that a command is at work, if it says nothing itself in its first seconds."""
+    """Print that a command is at work if it prints nothing else in its first seconds."""
 
     def speak() -> None:
         if _silent.is_set():
@@ -104,7 +104,7 @@ def never_silent(name: str) -> Iterator[None]:
 
 
 def say_estimate(what: str, seconds: float) -> None:
-    """One line on stderr before anything that takes more than a minute."""
+    """Print one line on stderr before anything that takes more than a minute."""
     if seconds > _MINUTE_S:
         span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
         say(f"estimate: {what} takes about {span} more")

@@ -17,7 +17,7 @@ from litho_data.foundation.files import parsed
 from litho_data.foundation.quantities import LENGTH_UM
 
 M = TypeVar("M", bound=BaseModel)
-# Squares of larger ones are no numbers of single precision.
+# Squares of larger numbers overflow single precision.
 _LARGEST = 1e15
 
 
@@ -27,12 +27,13 @@ def setting(
     """A field of a settings record.
 
     Args:
-        default: its value where nothing is said; ``...`` for none.
+        default: its value if none is given; ``...`` if it must be given.
         help: what it is, in a few words without a full stop.
         unit: of the value, such as µm.
         option: name or names on the command line, such as ``--pitch-um``; none for settings that are
             reached by their dotted path only.
-        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); no length is beyond all lengths.
+        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); a length in µm is at most the
+            largest length.
     """
     if unit == "µm":
         limits = {"le": LENGTH_UM.high} | limits
@@ -48,10 +49,10 @@ class Leaf:
 
     Attributes:
         path: dotted, as in ``layout.pitch_um``.
-        kind: annotation of the field, without its limits.
+        kind: annotation of the field, without limits.
         value: what the record holds.
         options: names on the command line.
-        group: what the record calls the part that the setting is in; empty at the root.
+        group: description of the part that the setting belongs to; empty at the root.
     """
 
     path: str
@@ -64,7 +65,7 @@ class Leaf:
 
 
 def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[Leaf]:
-    """Every setting of a record, those of its parts included."""
+    """Every setting of a record, including those of its parts."""
     for name, field in type(settings).model_fields.items():
         value, path = getattr(settings, name), f"{prefix}{name}"
         if isinstance(value, BaseModel):
@@ -83,12 +84,12 @@ def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[L
 
 
 def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "setting") -> dict[str, Any]:
-    """Values by dotted path, of nested or dotted keys.
+    """Values by dotted path, from nested or dotted keys.
 
     Args:
-        settings: a record whose names the keys must be.
+        settings: a record; every key must be one of its names.
         content: as read from a file, or ``{"layout.pitch_um": 0.2}``.
-        what: what messages call one of them.
+        what: what messages call a setting.
 
     Raises:
         InputError: a name that the record does not have; the message lists those that it has.
@@ -150,7 +151,7 @@ def changed(settings: M, changes: Mapping[str, Any]) -> M:
 
 
 def refused(error: ValidationError) -> InputError:
-    """What a record has to say about the first setting that it does not accept."""
+    """The error for the first setting that a record does not accept."""
     first = error.errors()[0]
     where, said = ".".join(map(str, first["loc"])), first["msg"]
     limit = said.removeprefix("Input should be ")
@@ -160,10 +161,10 @@ def refused(error: ValidationError) -> InputError:
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
-    """Values by dotted path of words ``path=value``; a value is JSON where it can be, a string otherwise.
+    """Values by dotted path, from words ``path=value``; a value is JSON if it parses, otherwise a string.
 
     Raises:
-        InputError: a word without ``=``, or a path that is there twice.
+        InputError: a word without ``=``, or a repeated path.
     """
     values: dict[str, Any] = {}
     for word in words:

@@ -50,8 +50,8 @@ def croissant(root: Mapping[str, Any], files: Sequence[Mapping[str, Any]], table
     """The description as JSON-LD.
 
     Args:
-        root: what the crate says of the dataset; ``files``: of its files.
-        table: CSV with one row per scan, which is described column by column.
+        root: the crate's entry for the dataset; ``files``: its entries for the files.
+        table: CSV with one row per scan; the description covers each column.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}
     said |= {"license": root["license"]["@id"]} if "license" in root else {}

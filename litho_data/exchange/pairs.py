@@ -112,7 +112,7 @@ class PairsJob:
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
-        """Hash of everything that decides the piece."""
+        """Hash of everything that determines the piece."""
         operation = OPERATIONS["stitch-pairs"]
         card = self.card.model_dump(mode="json")
         plan = [self.print_id, self.order, card, operation.version, operation.code_sha256, self._params]

@@ -40,10 +40,10 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
 
 
 def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
-    """Write a release folder: the packed store, its quality table, and what they are.
+    """Write a release folder: the packed store, its quality table, and their descriptions.
 
     ``ro-crate-metadata.json`` names every raw file with its SHA-256, the software of the build, licence and
-    citation; ``croissant.json`` the files and the columns of the table.
+    citation; ``croissant.json`` describes the files and the columns of the table.
 
     Raises:
         InputError: no store, a packed one, one without manifest, or a folder with something else in it.
@@ -72,7 +72,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def _root(store: Store) -> dict[str, Any]:
-    """What the dataset is."""
+    """The crate's entry for the dataset."""
     manifest = store.manifest
     card = manifest["card"]
     root: dict[str, Any] = {
@@ -111,7 +111,7 @@ def _graph(store: Store, root: dict[str, Any], files: list[dict[str, Any]]) -> l
             "@type": "CreateAction",
             "name": "Building the dataset from raw files",
             "startTime": build["started"],
-            # A store may be older than this.
+            # Older stores do not record the end.
             **({"endTime": build["ended"]} if "ended" in build else {}),
             "instrument": {"@id": "#software"},
             "object": [{"@id": f"#raw/{row['path']}"} for row in raw],

@@ -1,7 +1,7 @@
-"""One notion of begun, for every command that writes a folder: it states, begins, continues and finishes.
+"""How every command that writes a folder states, begins, continues and finishes its result.
 
-A command states what its result will be: the name of its record, which is written last, and the fields of the
-record that decide it. A folder is then one of these:
+A command first states what its result will be: the name of its record, which is written last, and the fields
+of the record that determine it. A folder is then one of these:
 
 =========  =======================================  =========================================================
 free       not there, or empty                      it is begun
@@ -10,7 +10,7 @@ finished   the record                               made again or continued, if 
 other      anything else                            refused, and nothing is changed
 =========  =======================================  =========================================================
 
-The law: a command that was stopped after any of its writes and is given again ends with the same result.
+The law: a command that was stopped after any of its writes and is run again ends with the same result.
 """
 
 import json
@@ -33,7 +33,7 @@ BEGUN = "begun.json"
 
 @dataclass(frozen=True)
 class Begun:
-    """A folder that a result grows in; ``finished``: the same result was there, and whole."""
+    """A folder in which a result grows; ``finished``: the same result was already complete."""
 
     folder: Path
     finished: bool
@@ -43,19 +43,19 @@ class Begun:
 def growing_folder(
     out: str | Path, record: str, facts: Mapping[str, Any] | None = None, *, holds: str = ""
 ) -> Iterator[Begun]:
-    """A folder whose files appear as they are finished, so that a stopped run goes on from them.
+    """A folder whose files appear as they are finished, so that a stopped run can resume.
 
-    What else lies in a folder of its own is left alone. One process at a time writes it.
+    Other files in a folder that holds this result are left alone. One process at a time writes the folder.
 
     Args:
         out: the folder; made if need be.
         record: the file that a finished result holds, such as ``run.json``. The block writes it last.
-        facts: fields of the record that decide the result; a folder with others is refused.
+        facts: fields of the record that determine the result; a folder with other values is refused.
         holds: what may lie there before it is begun, such as designs made one by one.
 
     Raises:
-        InputError: a file, a folder with something else in it, one of other facts, one that another process
-            is writing, or one that cannot be written: all before the block begins.
+        InputError: ``out`` is a file, holds something else or other facts, is being written by another
+            process, or cannot be written; raised before the block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)
@@ -86,7 +86,7 @@ def growing_folder(
 def whole_folder(
     out: str | Path, *holds: str, record: str = "", facts: Mapping[str, Any] | None = None
 ) -> Iterator[Path]:
-    """A folder that replaces ``out`` as a whole; what a stopped run left of it is no part of the next one.
+    """A folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
 
     Args:
         out: what will be replaced.
@@ -107,7 +107,7 @@ def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str
     """Whether the same result is begun there already."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
-    # A process that was stopped before it had said what it begins has begun nothing.
+    # A process that was stopped before it wrote what it begins has begun nothing.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
     require_own_folder(folder, record, *[BEGUN] * (own or nothing), *[holds] * bool(holds))
     require_same(folder, begun if own else read_record(folder / record), facts)

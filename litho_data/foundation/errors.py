@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _MANY = 12
-# What is found can be of any length.
+# The value found can be of any length.
 _LONGEST = 240
 
 
@@ -29,7 +29,7 @@ class InputError(ValueError):
 
 @contextmanager
 def about(what: str) -> Iterator[None]:
-    """Errors of a block say first what it is about."""
+    """Begin the messages of InputErrors in the block with ``what``."""
     try:
         yield
     except InputError as error:
@@ -38,10 +38,10 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Read what a program wrote and somebody may have changed since.
+    """Guard a block that reads a file that a program wrote and somebody may have changed since.
 
     Raises:
-        InputError: whatever is raised for content of another kind: no such key, no number, no JSON, …
+        InputError: in place of any error about the content: a missing key, a text for a number, no JSON, …
     """
     try:
         yield
@@ -52,7 +52,7 @@ def damaged(what: str) -> Iterator[None]:
 
 
 def said(error: Exception) -> str:
-    """Why something could not be read, without the words of Python."""
+    """Why something could not be read, in plain words instead of Python's."""
     if isinstance(error, UnicodeDecodeError):
         return "bytes that are no text"
     if isinstance(error, OSError) and error.strerror:
@@ -73,12 +73,12 @@ def require_known(what: str, got: str, known: Iterable[str]) -> None:
 def unknown_name(
     what: str, got: object, known: Iterable[str], hint: str = "", *, also: str = ""
 ) -> InputError:
-    """The error for a name that is not known; the hint is the nearest one that is, where one is near.
+    """The error for an unknown name; the hint is the nearest known name, if one is near.
 
     Args:
-        what: what the name is of.
-        got: the name; ``known``: those that there are.
-        hint: where no known name is near.
+        what: what the name stands for.
+        got: the name; ``known``: the known names.
+        hint: used if no known name is near.
         also: what could have been given instead of a name, such as "an image file".
     """
     names = list(known)

@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
-# litho_data does without it; it stands for all that the extras `models` and `design` bring.
+# litho_data does not need it; if it is missing, so are the extras `models` and `design`.
 _OF_EXTRAS = "torch"
-# Of GNU's OpenMP, and of Intel's.
+# For the OpenMP of GNU, and for that of Intel.
 _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 
 
 def let_waiting_threads_sleep() -> None:
-    """To be called before torch is loaded, whose threads would spin while they wait for one another.
+    """Call this before torch is loaded: its threads would otherwise spin while they wait for one another.
 
-    Beside one busy process a spinning pair of threads takes ten times as long. What the environment says
-    already stays.
+    Beside one busy process, a spinning pair of threads takes ten times as long. Environment variables that
+    are set already stay as they are.
     """
     for variable, value in _SLEEP.items():
         os.environ.setdefault(variable, value)
@@ -30,7 +30,7 @@ def let_waiting_threads_sleep() -> None:
 def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
-    In a package's ``__init__``, whose imports type checkers follow and Python reads as a list::
+    For a package's ``__init__``. Type checkers follow its imports; Python reads only their names::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan
@@ -38,7 +38,7 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
 
     Args:
-        package: ``__name__`` of the package. A public name must not be that of a room of the package, because
+        package: ``__name__`` of the package. No public name may equal that of a room of the package, because
             importing a room binds its name.
         file: its ``__init__``; every import with ``as`` in it is a public name.
 
@@ -76,7 +76,7 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
 
 
 def require_extra(command: str, extra: str) -> None:
-    """End a command with one line on stderr and exit code 2 where what its extra brings is not installed."""
+    """End a command with one line on stderr and exit code 2 if the extra that it needs is not installed."""
     let_waiting_threads_sleep()
     if importlib.util.find_spec(_OF_EXTRAS) is None:
         print(f"{command}: {_missing(extra)}", file=sys.stderr)

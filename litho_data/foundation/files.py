@@ -48,7 +48,7 @@ def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
     If a user chose the path, use ``litho_data.foundation.begun.whole_folder``.
 
     Args:
-        wait: for another process that is writing it, or else refuse.
+        wait: whether to wait for another process that is writing it; otherwise refuse.
 
     Raises:
         InputError: ``path`` cannot be written, or another process is writing it.
@@ -81,11 +81,11 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
             try:
                 work.mkdir(parents=True, exist_ok=True)
             except FileExistsError:
-                # Who held the lock before may have removed the folder between the two looks at it.
+                # The last holder of the lock may have removed the folder between these two checks.
                 if work.exists() and not work.is_dir():
                     raise
                 continue
-            # Who held the lock before removes its file.
+            # The last holder of the lock removes the lock file.
             with contextlib.suppress(FileNotFoundError):
                 lock = locked(work / "lock", target, wait)
                 if os.path.samestat(os.fstat(lock.fileno()), (work / "lock").stat()):
@@ -97,7 +97,7 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
 
 
 def publish(new: Path, path: str | Path) -> None:
-    """Rename a finished folder to ``path``; within ``unfinished``, which keeps an older one until then."""
+    """Rename a finished folder to ``path``, within ``unfinished``, which keeps an older one until then."""
     target = Path(path)
     if target.exists():
         target.replace(_work(target) / "old")
@@ -108,7 +108,7 @@ def publish(new: Path, path: str | Path) -> None:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove what a stopped process left of files and folders that it was writing below ``folder``."""
+    """Remove the partial files and folders that a stopped process left below ``folder``."""
     for left in sorted(folder.rglob(".*.partial*")):
         if left.is_dir():
             _put_back(left, left.parent / left.name[1:].removesuffix(".partial"))
@@ -122,7 +122,7 @@ def _work(target: Path) -> Path:
 
 
 def _put_back(work: Path, target: Path) -> None:
-    """An older folder that was put aside for a new one, which did not come."""
+    """Put back an older folder that was moved aside for a new one that never came."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.replace(target)
@@ -130,10 +130,10 @@ def _put_back(work: Path, target: Path) -> None:
 
 
 def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
-    """The file, open to add to, with an advisory lock that ends with it or with the process.
+    """The file, open for appending and locked; the advisory lock ends with the file or the process.
 
     Raises:
-        InputError: another process holds it, as the one that writes ``target``.
+        InputError: another process, which is writing ``target``, holds the lock.
     """
     stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
     if not _lock(stream, wait):
@@ -143,7 +143,7 @@ def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
 
 
 def _lock(stream: IO[str], wait: bool = False) -> bool:
-    """Whether the lock could be had; a system without such locks does without."""
+    """Take the lock and say whether that worked; True as well on a system without such locks."""
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -155,7 +155,7 @@ def _lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 def _remove_unless_held(left: Path) -> None:
-    """Remove what a process that was stopped left of a file; another that is writing it holds its own."""
+    """Remove a partial file that a stopped process left; a file that is still being written is locked."""
     with contextlib.suppress(FileNotFoundError), open(left) as stream:
         if _lock(stream):
             left.unlink()
@@ -165,8 +165,8 @@ def read_text(path: Path) -> str:
     """The text of a file.
 
     Raises:
-        OSError: none that can be read, also a pipe, which would keep its reader waiting.
-        UnicodeDecodeError: bytes that are no UTF-8.
+        OSError: the file cannot be read, or is a pipe, which would keep its reader waiting.
+        UnicodeDecodeError: the bytes are not UTF-8.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError(errno.EINVAL, "a pipe or a device, no file", str(path))
@@ -174,10 +174,10 @@ def read_text(path: Path) -> str:
 
 
 def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> Any:
-    """What a parser of TOML or JSON makes of a text file.
+    """The content of a text file, parsed as TOML or JSON.
 
     Raises:
-        InputError: about ``what``: no file, or another text than the parser takes.
+        InputError: no such file, or text that does not parse; the message begins with ``what``.
     """
     try:
         return parse(read_text(file))
@@ -187,7 +187,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Make the first files of an output; an error of the file system becomes an InputError."""
+    """For writing the first files of an output: an error of the file system becomes an InputError."""
     try:
         yield
     except OSError as error:

@@ -22,7 +22,7 @@ class PixelGrid:
             lies at ``origin + (i + 0.5) * pitch``.
 
     Raises:
-        InputError: a size below one pixel, or a pitch that can be none.
+        InputError: a size below one pixel, or an impossible pitch.
     """
 
     shape: tuple[int, int]

@@ -1,4 +1,4 @@
-"""What nearly every signature holds: maps, their shapes, and pairs of lengths along y and x."""
+"""Types that nearly every signature uses: maps, their shapes, and pairs of lengths along y and x."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The gate for names: what comes out of a received file and may become part of a path is a plain name."""
+"""The gate for names: a name from a received file that may become part of a path must be plain."""
 
 import re
 from typing import Annotated
@@ -13,14 +13,14 @@ _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether the text can be one file's name on any system, and never a path, hidden or an option."""
+    """Whether the text is a file name on every system, and never a path, a hidden file or an option."""
     return (
         isinstance(name, str)
         and 0 < len(name.encode("utf-8", "replace")) <= _LONGEST_BYTES
         and not _NO_NAME.search(name)
         and name[0] not in ".-~ "
         and name[-1] not in ". "
-        # Surrogates of undecodable bytes are no text.
+        # Surrogates stand for undecodable bytes, not for text.
         and name.isprintable()
     )
 
@@ -29,7 +29,7 @@ def require_plain_name(what: str, name: str) -> str:
     """The name itself.
 
     Raises:
-        InputError: it could lead somewhere else as a part of a path.
+        InputError: as part of a path, the name could lead somewhere else.
     """
     if not is_plain_name(name):
         raise InputError(what, got=repr(name)[:80], wanted="a plain name, without path")

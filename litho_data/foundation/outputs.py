@@ -1,7 +1,7 @@
 """What ``--out`` may be, for every command: nothing but an older result of its own is ever replaced.
 
-A folder that is not there or empty is taken. In a folder with an earlier run of the same command on the same
-subject (dataset, model, design) with the same settings the run resumes, or its result is made again. Anything
+A missing or empty folder is accepted. If the folder holds an earlier run of the same command on the same
+subject (dataset, model, design) with the same settings, the run resumes or its result is made again. Anything
 else is refused, and nothing is changed.
 """
 
@@ -41,7 +41,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
-    """Refuse a folder whose record, of a result finished or begun, holds other facts than these."""
+    """Refuse a folder whose record, finished or begun, holds other facts than these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
@@ -53,14 +53,14 @@ def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
 
 
 def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
-    """The first setting of ``now`` that was another one then, or none, in words; "" if all are the same."""
+    """The first setting of ``now`` that ``then`` lacks or has with another value, in words; "" if none."""
     for name, after in now.items():
         if isinstance(after, dict):
             if deeper := first_difference(then.get(name) or {}, after, f"{path}{name}."):
                 return deeper
         elif name not in then or then[name] != after:
             short = name in then and not isinstance(after, list)
-            return f"{path}{name}" + (f" = {then[name]!r} where now {after!r} is asked" if short else "")
+            return f"{path}{name}" + (f" = {then[name]!r}, but now {after!r} is asked for" if short else "")
     return ""
 
 
@@ -71,16 +71,16 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     with schema ``litho-models/close-loop/1``.
 
     Args:
-        path: where the result will be; what else lies in a folder of its own is left alone.
+        path: where the result will be; other files in a folder that holds this result are left alone.
         record: the file that a finished result holds.
-        begun: names, or patterns of names, of what an interrupted run of the same kind leaves.
+        begun: names, or patterns of names, of files that an interrupted run of the same kind leaves.
 
     Raises:
         InputError: a file, or a folder with another result or with something else in it.
     """
     folder = Path(path)
     _refuse_a_file(folder)
-    # What desktops and version control leave is no content.
+    # Files of desktops and version control do not count as content.
     names = sorted(one.name for one in folder.glob("*") if not one.name.startswith("."))
     strangers = [name for name in names if name != record and _is_record(folder / name)]
     if not strangers and not any(fnmatch(name, mark) for name in names for mark in (record, *begun)):
@@ -90,7 +90,7 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
         raise InputError(
             "output",
             got=f"{folder}, which {'is a dataset store' if store else f'holds {strangers[0]}'}",
-            wanted="a new folder, or one of this command alone",
+            wanted="a new folder, or one that only this command writes",
             hint="" if store else f"for example {folder / Path(record).stem}",
         )
 

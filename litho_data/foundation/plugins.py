@@ -1,7 +1,7 @@
-"""Plug-ins: modules that register something of one's own (a reader, an effect, a model) when imported.
+"""Plug-ins: modules that register a reader, an effect or a model of your own when they are imported.
 
-One is found by its entry point in the group ``litholoop.plugins``, or named as a file. Every command and
-every worker loads them before its work begins.
+A plug-in is found by its entry point in the group ``litholoop.plugins``, or named as a file. Every command
+and every worker loads all plug-ins before its work begins.
 """
 
 import importlib.util
@@ -14,15 +14,15 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 
 GROUP, OPTION = "litholoop.plugins", "--plugin"
-# Name of an installed one, or the file, to what tells one state of it from another.
+# Name or file of each loaded plug-in, to its version or the beginning of its hash.
 _LOADED: dict[str, str] = {}
 
 
 def load_plugins(files: Iterable[str | Path] = ()) -> None:
-    """Import all plug-ins that are installed, and these files; each once in a process.
+    """Import all installed plug-ins and these files, each once per process.
 
     Raises:
-        InputError: no file of Python, or a plug-in that fails.
+        InputError: a file that is not Python, or a plug-in that fails.
     """
     for point in metadata.entry_points(group=GROUP):
         version = point.dist.version if point.dist else ""
@@ -40,7 +40,7 @@ def plugin_files() -> list[str]:
 
 
 def plugin_versions() -> dict[str, str]:
-    """What was loaded, each with its version, or the beginning of the hash of its file."""
+    """Each loaded plug-in with its version, or the beginning of its file's hash."""
     return {f"plug-in {Path(name).name}": version for name, version in _LOADED.items()}
 
 
@@ -76,11 +76,11 @@ def _load(name: str, version: str, load: Callable[[], object]) -> None:
 
 
 def _import(path: Path) -> None:
-    """Run a file as a module that goes by its own name, by which its classes reach other processes."""
+    """Run a file as the module of its own name, so that other processes can import its classes by it."""
     known = sys.modules.get(path.stem)
     if known is not None:
-        got = f"{path.name}, by whose name goes {getattr(known, '__file__', None) or 'a part of Python'}"
-        raise InputError("plug-in", got=got, wanted="a file with a name of its own")
+        got = f"{path.name}, whose name belongs to {getattr(known, '__file__', None) or 'a part of Python'}"
+        raise InputError("plug-in", got=got, wanted="a file with an unused name")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None

@@ -51,7 +51,7 @@ class Result(Record):
         return pd.DataFrame(self._facts()).to_html(index=False, header=False)
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What fits into a line: short values, names of parts, and how many there are of what is longer."""
+        """What fits on a line: short values, names of parts, and the lengths of longer values."""
         facts = []
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -105,4 +105,4 @@ def first_error(error: ValidationError) -> str:
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a number in JSON")

@@ -33,8 +33,8 @@ def write_card(
         name: of the dataset; ``title``: one line for people.
         pitch_um: of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
         scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: of the files of the microscope.
-        levelled: whether a build is to take the heights as they are in the files.
-        tables: further ones of the card, such as ``ids`` and ``write``; None is not written.
+        levelled: whether a build takes the heights from the files without levelling them.
+        tables: further tables of the card, such as ``ids`` and ``write``; a table that is None is left out.
 
     Raises:
         InputError: a value that a card may not have.
@@ -71,7 +71,7 @@ def _stated(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _toml(table: Mapping[str, Any]) -> str:
-    # Strings, numbers, truth and lists of them are written alike in JSON and in TOML.
+    # Strings, numbers, booleans and lists of them look the same in JSON and in TOML.
     return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in table.items())
 
 

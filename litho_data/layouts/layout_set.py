@@ -25,7 +25,7 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# Leaves an even strip of 1 µm between two edges, each of which the printer blurs over 1 µm.
+# Leaves an even strip of 1 µm between two edges, as the printer blurs each edge over 1 µm.
 _TREAD_UM = 3.0
 
 
@@ -94,7 +94,7 @@ def write_layout_set(
 
     Raises:
         InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
-            folder with a set of other settings or something else in it, such as scans.
+            folder that holds a set with other settings or something else, such as scans.
     """
     require_known("pattern", pattern, PATTERNS)
     if not 2 <= levels <= 256:

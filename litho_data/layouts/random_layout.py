@@ -25,8 +25,8 @@ def random_layout(
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the
     nearest of ``levels`` values. The result is periodic in both directions. The paper leaves the
     low-pass filter open: the measured layouts show a sharp square pass band of ±0.25 cycles/µm
-    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels
-    were cut off, not rounded: ``quantiser="floor", field_px=540`` makes layouts like them.
+    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were
+    truncated, not rounded: ``quantiser="floor", field_px=540`` makes layouts like them.
 
     Args:
         shape: (ny, nx), pixels.
@@ -65,7 +65,7 @@ def random_layout(
         passband=passband,
     )
     lowest, highest = field.min(), field.max()
-    # If only the mean passes, rounding of the transform leaves about 1e-17.
+    # If only the mean passes, the rounding of the transform still leaves about 1e-17.
     if highest - lowest < 1e-12:
         raise InputError(
             "cutoff_per_um of a random layout",

@@ -28,7 +28,7 @@ class LayoutStatistics(Result):
         power_share: share of the power (mean level excluded) in each bin, sums to 1.
         lag_um: lags of the autocorrelation, µm.
         autocorrelation_x, autocorrelation_y: of the level about the layout's mean, 1 at lag 0.
-        settings: of a set that was made here, None for any other.
+        settings: settings of a set that ``write_layout_set`` made, otherwise None.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/layouts/1"

@@ -83,7 +83,7 @@ def mask_and_relevel(
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     usable = np.isfinite(z) if chosen is None else chosen
     surface = robust_surface(z, chosen, terms)
-    # The noise is estimated once: estimated again over the remaining pixels, it would shrink every round.
+    # The noise is estimated only once: over the remaining pixels it would shrink in every round.
     limit = threshold * noise_sigma((z - surface)[usable])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):

@@ -47,9 +47,9 @@ def level_layout_aware(
         z: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that
-            leaves the least. Pixels within two of them of the edge of the layout are not fitted: there the
-            height depends on what surrounds it.
+        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the best fitting of a few
+            values. Pixels within two sigma of the edge of the layout are not fitted, because their height
+            depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
@@ -76,7 +76,7 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """The known pixels that are further than a border from unknown ones; all of them if few are left."""
+    """The known pixels farther than a border from unknown ones; all known pixels if few are left."""
     if known.all():
         return known
     inner = ndimage.distance_transform_edt(known) > border_px
@@ -117,7 +117,7 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Coefficients of the background, in the Legendre basis of ``evaluate``; and how little was explained."""
+    """Legendre coefficients of the background for ``evaluate``, and minus the explained sum of squares."""
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]

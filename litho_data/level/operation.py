@@ -38,14 +38,14 @@ class Step(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # What the operation takes of the state, and whether it can do without.
+    # The fields of the state that the operation takes, and whether each is optional.
     takes: ClassVar[dict[str, bool]]
 
     op: str
     masking: Masking = "exclude"
 
     def run(self, state: State) -> State:
-        """The state with the levelled map, or with what was marked as its mask, or with both."""
+        """The state with the levelled map, with the marked pixels as its mask, or with both."""
         arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
         for name, optional in self.takes.items():
             arguments[name] = getattr(state, name)
@@ -60,12 +60,12 @@ class Step(BaseModel):
 
 
 def operation(op: str, base: type[Step] = Step) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Make a function of heights and of the pixels that it may use the operation of that name.
+    """Register a function of heights and usable pixels as the operation of that name.
 
-    The function gets float64 (ny, nx), and bool (ny, nx) or None for all pixels; it is called with a map of
-    any type, a ``mask`` and ``masking``, see ``select``. Of its keyword arguments those that ``State`` has
-    are taken from there, all others are fields of the step, checked at every call. It returns a ``Levelled``,
-    a ``MaskedLevelling``, or pixels to mark as a bool array.
+    The function gets heights, float64 (ny, nx), and usable pixels, bool (ny, nx) or None for all. Callers
+    pass a map of any type, a ``mask`` and ``masking``; see ``select``. Keyword arguments that are fields of
+    ``State`` come from the state; all others are fields of the step, checked at every call. It returns a
+    ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

@@ -116,7 +116,7 @@ def level_rotate(
 def _rotate_rows(z: Array, slope: float, pitch_um: float) -> Array:
     angle = -np.arctan(slope)
     position = (np.arange(z.shape[1]) - (z.shape[1] - 1) / 2) * pitch_um
-    # Rotating about the profile's own middle keeps the height there, whatever the datum.
+    # Rotating about the middle of the profile keeps the height of the middle, whatever the datum.
     last = z.shape[1] - 1
     pivot = 0.5 * (z[:, last // 2] + z[:, (last + 1) // 2])[:, None]
     moved_x = position * np.cos(angle) - (z - pivot) * np.sin(angle)

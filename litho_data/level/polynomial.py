@@ -65,7 +65,7 @@ def fit_terms(z: Array, weights: Array | None, terms: Terms) -> Array:
 
     Args:
         z: (ny, nx); NaN only where the weight is zero.
-        weights: (ny, nx), not negative, or the pixels that count one; None for one everywhere.
+        weights: (ny, nx), not negative, or bool with weight 1 for True; None for 1 everywhere.
 
     Raises:
         InputError: the weighted pixels do not determine all terms.

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import litho_data.level.features
 import litho_data.level.layout_aware
 
-# Each adds its operations.
+# Importing each module registers its operations.
 import litho_data.level.plane
 import litho_data.level.polynomial
 import litho_data.level.scars  # noqa: F401
@@ -100,7 +100,7 @@ class Recipe(BaseModel):
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
-        """The result of ``apply``, and in words what its steps warn of instead of warnings."""
+        """The result of ``apply``, and the warnings of its steps as texts instead of Python warnings."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)
             levelled = self.apply(scan, **arguments)

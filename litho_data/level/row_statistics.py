@@ -11,7 +11,7 @@ from litho_data.foundation.kinds import Array
 MEDIAN_TRIM = 0.5
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Of heights in metres: more than files state, fewer than rounding between units disturbs.
+# Digits of heights in metres: more than files state, fewer than converting units changes.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to here are exact in a double.
 _LARGEST_EXACT_POWER = 22

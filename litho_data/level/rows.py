@@ -107,13 +107,13 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """What to know of an alignment that moved lines although part of their pixels stayed; empty for others.
+    """A warning if an alignment moved lines although many of their pixels stayed in place; otherwise empty.
 
     An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more
     than the noise, and many of its pixels do not differ from the neighbour, a structure moved the others.
 
     Args:
-        z: (ny, nx) before; ``removed``: what was taken from it; both with lines as rows.
+        z: (ny, nx) before alignment; ``removed``: what was subtracted from it; lines are rows in both.
     """
     steps, shifts = np.diff(z, axis=0), np.diff(removed, axis=0)
     noise = _SIGMA_PER_MAD * float(np.nanmedian(np.abs(steps - np.nanmedian(steps, axis=1, keepdims=True))))
@@ -128,7 +128,7 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array | None, fewest: int) -> Array:
-    """The statistics of the rows, that of the whole in the place of those from too few pixels, mean zero."""
+    """The statistics of the rows, mean zero; rows with too few pixels take that of the whole map."""
     if chosen is not None:
         values = z[chosen]
         shifts[row_counts(z, chosen) < fewest] = np.partition(values, values.size // 2)[values.size // 2]
@@ -142,7 +142,7 @@ def _difference_shifts(z: Array, chosen: Array | None, trim: float) -> Array:
     if both is not None:
         step[row_counts(steps, both) < fewest_for_row(z.shape[1])] = 0.0
     shifts = np.concatenate([[0.0], np.cumsum(step)])
-    # Steps alone cannot separate drift from slope: the linear part stays in the data.
+    # Steps alone cannot separate drift from slope, so the linear part stays in the data.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
@@ -151,7 +151,7 @@ def _matching_shifts(z: Array, chosen: Array | None, last_column_counts: bool) -
     """Weighted mean steps between rows.
 
     Args:
-        last_column_counts: whatever the mask says there, as in Gwyddion's include mode.
+        last_column_counts: use the last column whatever the mask says, as in Gwyddion's include mode.
     """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
     usable = np.ones(steps_m.shape, dtype=bool) if chosen is None else chosen[1:] & chosen[:-1]

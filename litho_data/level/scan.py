@@ -21,7 +21,7 @@ _DIMS = ("y", "x")
 
 
 class LevelRecord(RunFacts, Result):
-    """What was levelled, how, and what came out; beside the levelled file as ``<file>.json``."""
+    """What was levelled, how, and the result; written beside the levelled file as ``<file>.json``."""
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
     FILE_NAME: ClassVar[str] = "level.json"

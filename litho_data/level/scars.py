@@ -33,7 +33,7 @@ def mark_scars(
     A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel
     and the higher of the two pixels that bound it above and below (the mirror image for negative
     ones), in units of rms = sqrt(sum of squared differences between rows / number of pixels).
-    Runs along a row count where they reach ``high`` somewhere, stay above ``low`` and are at least
+    A run along a row counts if it reaches ``high`` somewhere, stays above ``low`` and is at least
     ``min_length_px`` long.
 
     Returns:
@@ -107,7 +107,7 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Values of the unknown pixels, in the order of ``z[unknown]``; what was not measured is filled along."""
+    """Values of the unknown pixels, as ``z[unknown]``; the solution covers unmeasured pixels as well."""
     from SurfaceTopography import Topography
 
     left_out = unknown | ~np.isfinite(z)

@@ -71,7 +71,7 @@ def subtract(z: Array, removed: Array) -> Levelled:
 def subtract_product(z: Array, along_y: Array, along_x: Array) -> Levelled:
     """The map minus the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
 
-    A few rows at a time: the surface is then still in the cache when it is subtracted.
+    It works on a few rows at a time, so that the surface is still in the cache when it is subtracted.
     """
     levelled = Levelled(np.empty_like(z), np.empty_like(z))
     for first in range(0, len(z), _ROWS_IN_CACHE):

@@ -30,8 +30,8 @@ IMAGES = "o"
 class Source:
     """Everything that a store is made from, with the raw files by id for the manifest.
 
-    ``files`` maps each id to its raw files by recorded name, ``standards`` holds those of the calibration;
-    ``unpaired`` and ``refused`` map ids to reasons.
+    ``files`` maps each id to its raw files by recorded name, ``standards`` holds the raw files of the
+    calibration; ``unpaired`` and ``refused`` map ids to reasons.
     """
 
     card: Card
@@ -62,7 +62,7 @@ def assemble(
         load: the arrays of an id on the layout grid.
         source: what the records were made from.
         skipped: per id, why it is not in the store.
-        build: what must not be part of a hash: time, folder, software.
+        build: facts that must not be part of a hash: time, folder, software.
     """
     scans = [_row(record) for record in records_of_use(records)]
     write_samples(root, scans, load, source.card.layout.pitch_um)
@@ -97,7 +97,7 @@ def facts_of_card(card: Card) -> dict[str, Any]:
 def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
     """The attributes of the root group; all but the two hashes follow from the manifest.
 
-    Numbers and words only, which any format can hold.
+    They are numbers and words only, which any format can hold.
     """
     card = Card.model_validate(manifest["card"])
     facts = facts_of_card(card)
@@ -113,7 +113,7 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
         "citation": card.citation,
         **facts,
         **written,
-        # Tools for OME-Zarr look for images under the names in this list; a word of one letter is one name.
+        # Tools for OME-Zarr look for images under the names in this list.
         "labels": IMAGES,
         "assumptions": "; ".join(manifest["assumptions"]),
         "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
@@ -169,7 +169,7 @@ def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def table_sha256(table: pd.DataFrame) -> str:
-    """Hash of a table: column names and values, in order, without the software column, which varies."""
+    """Hash of a table: column names and values, in order, except for the software column, which varies."""
     columns = {}
     for name in sorted(str(column) for column in table.columns if column != "software"):
         values = table[name].to_numpy()
@@ -209,7 +209,7 @@ def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[
     Returns:
         Columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256`` of the
         bytes that were used (empty for a file that cannot be read), ``size_bytes``, and ``read``, JSON with
-        reader, unit, channel, pitch and the full header of the vendor.
+        reader, unit, channel, pitch and the vendor's full header.
     """
     import pandas as pd
 

@@ -29,7 +29,7 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# A larger difference from the pixel aspect of other scans comes from missing rows or columns.
+# If the pixel aspect differs more than this from that of other scans, rows or columns are missing.
 _ASPECT_TOLERANCE = 1e-3
 _MOST_SEARCHES = 2000
 
@@ -60,12 +60,12 @@ def build_dataset(
         workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
         strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
         seed: of the robust registration.
-        tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans, in place of the
-            card's: pixels that it may not have touched are not valid.
+        tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans; it replaces the
+            card's. Pixels that the tip may not have touched become invalid.
 
     Raises:
         InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, a tip that is no
-            radius, or ``out`` that is no store.
+            radius, or something at ``out`` that is no store.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:
@@ -87,7 +87,7 @@ def _recipe(listing: Listing) -> dict[str, Any]:
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
     standards = standards_of(listing)
     if standards.described:
-        # A bad standard spoils every scan: said once, before any is made.
+        # A bad standard spoils every scan, so it is reported once, before any scan is made.
         measure_scales(standards.described, list(standards.files.values()))
     found = {one.id: [one.layout, one.scan] for one in listing.fields}
     found |= {one.id: [*one.files] for one in listing.left_aside}
@@ -123,13 +123,13 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             what = f"building {source.card.name}"
             for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
                 if isinstance(outcome, Skipped):
-                    # Recorded names: the manifest must not depend on where the raw files lie.
+                    # Names as recorded, because the manifest must not depend on where the raw files lie.
                     skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
                     _report_skipped(outcome.id, skipped[outcome.id])
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
-            # Of the cluster: finished scans stay for the next run.
+            # An error of the cluster: finished scans stay for the next run.
             if not records:
                 partial.discard()
             raise
@@ -191,14 +191,14 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """Say of scans that did not register which other layout of the set they show, if there is one."""
+    """For scans that did not register, add to the reason which other layout of the set they show, if any."""
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    # One layout may be printed, and one print scanned, more than once: it goes by its first id.
+    # A layout may be printed, and a print scanned, more than once; the layout is named by its first id.
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
-    # A search takes a twentieth of a second.
+    # One search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
         read = fields[key].read()
         if "raw_height_um" not in read.arrays:
@@ -214,7 +214,7 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
-    """Scans whose pixels have another aspect than most, if the card and not the file gives the size.
+    """Scans whose pixels have another aspect than most, if the size comes from the card, not from the file.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
     """

@@ -17,12 +17,12 @@ from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
 SCALES = ("y", "x", "z")
-# A measured height further from the known one says that a unit or a file is wrong.
+# If a measured height is further from the known one, a unit or a file is wrong.
 _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """The scales that a build of a card would apply: of ``y``, ``x`` and ``z`` those that it calibrates.
+    """The scales that a build of the card would apply: those of ``y``, ``x`` and ``z`` that it calibrates.
 
     Raises:
         InputError: a card without ``[calibration]``, a missing file, or a scan that shows no grating or step.
@@ -38,13 +38,13 @@ def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict
 
 @dataclass(frozen=True)
 class Standards:
-    """What a card calibrates by; empty without ``[calibration]``.
+    """The calibration standards of a card; empty without ``[calibration]``.
 
     Attributes:
         described: per standard ``scale`` (x, y or z), ``file`` (a number, in the order of the files),
             ``known_um``, ``uncertainty_um``, ``across`` (axis of the profiles) and ``read``, the options of
             ``read_scan``.
-        files: by recorded name.
+        files: the files by recorded name.
     """
 
     described: tuple[Mapping[str, Any], ...] = ()
@@ -98,12 +98,12 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> Array:
-    """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 of what has no standard.
+    """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 without a standard.
 
     Raises:
         InputError: a scan that shows no grating or step of about the known size.
     """
-    # Every scan of a build asks for them.
+    # Cached, because every scan of a build asks for them.
     times = tuple(file.stat().st_mtime_ns for file in files)
     return _measured(json.dumps(list(standards)), tuple(files), times).copy()
 

@@ -1,8 +1,8 @@
 """From an electron micrograph to the edges of a film: signed distances, and the height they stand for.
 
-What stands up is bright, its rim brightest, and charging bends both; the edge is taken half way between the
-brightness of the ground and that of the rim, both as they are around it. Where the wall of the film has its
-edge within the width of the rim's flank is a convention that a micrograph cannot check.
+The film is bright, its rim is brightest, and charging distorts both. The edge is placed half way between the
+brightness of the ground and that of the rim in its neighbourhood. Which point on the flank of the rim is the
+edge of the film's wall is a convention that a micrograph cannot check.
 """
 
 from typing import NamedTuple
@@ -13,23 +13,23 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 
 REACH_PX = 8.0
-"""Distances are known up to this many pixels of the micrograph; beyond they are this."""
+"""Distances are clipped to this many pixels of the micrograph."""
 _NOISE_PX = 1.0
-# Where the brightness of rim and ground is taken, px from the first edge, and over which length (sigma).
+# Distances from the first edge, px, that count as rim and as ground; sigma of their local means.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
-# The edge is sought so close to the first, that of one threshold for the whole picture.
+# Largest distance from the first edge, which comes from one threshold for the whole picture.
 _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# A part of the layout of which so little is as wanted is lost.
+# A part of the layout counts as lost if no larger share of it was printed.
 _LOST = 0.1
 
 
 class Edges(NamedTuple):
     """``distance_px`` (ny, nx) from the nearest edge, positive on the film; ``sigma_px``: of one edge pixel.
 
-    ``specks``: bool (ny, nx), dots and pinholes of at most 40 px, which were passed over.
+    ``specks``: bool (ny, nx), dots and pinholes of at most 40 px, which are ignored.
     """
 
     distance_px: Array
@@ -50,7 +50,7 @@ def find_edges(grey: Array) -> Edges:
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
-    # Of logarithms: bright rims and charging count for less.
+    # A threshold on logarithms, so that bright rims and charging count for less.
     logarithm = np.log(smooth + _DARKEST)
     first = logarithm > threshold_otsu(logarithm)
     film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)
@@ -92,13 +92,13 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
-    """Where a micrograph shows what cannot be print: film deep in a gap of the layout, or a pit in its film.
+    """Where a micrograph shows a defect: film deep in a gap of the layout, or a pit in the film.
 
-    A gap that is closed as a whole, or an island lost as a whole, is print.
+    A gap that is closed entirely, or an island that is lost entirely, counts as print.
 
     Args:
-        covered: coverage (ny, nx), NaN where not seen; ``layout_share``: that of the layout.
-        depth_px: from the layout's edges: what lies nearer may be print. Widened by as much.
+        covered: coverage (ny, nx), NaN where not seen; ``layout_share``: coverage by the layout.
+        depth_px: what lies nearer to an edge of the layout may be print; defects are widened by as much.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

@@ -11,9 +11,9 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """The jobs with the radius in the place of ``blind``, or without a tip where the scans set no bound.
+    """The jobs with the radius in place of ``blind``, or without a tip if the scans set no bound on it.
 
-    Says on stderr what was found. Scans that cannot be read say nothing here; their jobs tell why.
+    It prints the result on stderr. Scans that cannot be read are left out; their jobs report why.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)
@@ -27,7 +27,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:
         print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
-    # Rounded far below its uncertainty: the order in which scans are finished must not show.
+    # Rounded far below its uncertainty, so that the order in which scans finish does not matter.
     rounded = None if radius_um is None else float(f"{radius_um:.9g}")
     card = jobs[0].card
     process = card.process.model_copy(update={"tip": rounded})
@@ -35,7 +35,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """What one scan says about the tip, in calibrated lengths if there are standards; None if unread."""
+    """What one scan says about the tip, in calibrated lengths if there are standards; None if unreadable."""
     try:
         read, calibrated = job.read(), job.calibrate()
     except InputError:

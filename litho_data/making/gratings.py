@@ -14,14 +14,14 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """One scan of a grating; figures are None where it does not show them, and ``problem`` says why.
+    """One scan of a grating; figures that it does not show are None, and ``problem`` says why.
 
     Args:
-        scale_x, scale_y: what a stated length has to be multiplied by; ``_sd``: standard uncertainties.
-        bow_um: by how much the middle of a line lies too far along x, against its ends.
+        scale_x, scale_y: factors for stated lengths; ``_sd``: their standard uncertainties.
+        bow_um: how far the middle of a line is displaced along x relative to its ends.
         line_um: length of a line.
-        tip_at_most_um: the most that the radius of the tip can be. A tip so blunt that it bridges the gaps
-            between bars shows less of its curvature than it has.
+        tip_at_most_um: upper bound on the radius of the tip. A tip so blunt that it bridges the gaps between
+            bars looks sharper than it is.
     """
 
     id: str
@@ -38,7 +38,7 @@ class GratingScan(Record):
 
 
 def grating_scans(store: Store) -> list[GratingScan]:
-    """The gratings among the references of a store, fast axis x, measured in the scans as they were read."""
+    """The gratings among a store's references with fast axis x, measured in the scans as they were read."""
     known = store.manifest.get("card", {}).get("grating")
     if known is None:
         return []
@@ -53,13 +53,13 @@ def grating_scans(store: Store) -> list[GratingScan]:
 
 
 def grating_scan(scan_id: str, height_um: Array, pitch_um: YX, known: KnownGrating) -> GratingScan:
-    """One scan, heights (ny, nx) in µm of a stated (y, x) pitch."""
+    """Measure one scan: heights (ny, nx) in µm at a stated (y, x) pitch."""
     height_um = height_um.astype(float)
     found = GratingScan(id=scan_id, period_um=known.period_um, line_um=height_um.shape[1] * pitch_um[1])
     tip = peak_radius(height_um, pitch_um)
     figures: dict[str, Any] = {}
     if tip.radius_um is not None:
-        # A bound has that added already.
+        # A bound already includes the uncertainty.
         figures["tip_at_most_um"] = tip.radius_um + (0.0 if tip.reason else _BOUND_SIGMA * tip.sd_um)
     try:
         waves = [find_wave(height_um, pitch_um, known.period_um, axis) for axis in ("x", "y")]

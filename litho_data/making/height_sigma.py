@@ -25,25 +25,25 @@ def height_sigma(
     fast_axis: Axis = "x",
     z_uncertainty: float = 0.0,
 ) -> tuple[Array, Mapping[str, float]]:
-    """The standard uncertainty of registered heights, the offset of the scan aside.
+    """The standard uncertainty of registered heights, apart from the offset of the scan.
 
-    The variance is a sum of six parts: white noise of pixels and of lines as far as the resampling leaves
-    it, the error of the resampling itself, the slope times the uncertainty of the warp, the surface that
-    levelling left or took, and the calibration of the z scale times the height over the scan's mean.
+    The variance is a sum of six parts: white noise of pixels and of lines after resampling, the error of the
+    resampling itself, the slope times the uncertainty of the warp, the surface that levelling left or wrongly
+    removed, and the uncertainty of the z scale times the height over the scan's mean.
 
     Args:
         levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
         height_um: the same on the layout's grid, NaN where not valid.
         layout_level: levels on that grid.
         blur_px, model: of the registration, see ``warp_error``.
-        levelled: whether a recipe was applied. What it took of the print then counts as it is found; without
-            one a surface beside the print counts only if it is clear.
-        fast_axis: along which the tip moved.
-        z_uncertainty: relative, of the z scale; 0 if it was not calibrated.
+        levelled: whether a recipe was applied. If so, what it removed of the print counts at its estimate; if
+            not, a surface beside the print counts only if it is clear.
+        fast_axis: the axis along which the tip moved.
+        z_uncertainty: relative uncertainty of the z scale; 0 if it was not calibrated.
 
     Returns:
-        float32 µm on the layout's grid, NaN where not valid; and per part the root mean square, as
-        ``sigma_<part>_nm``, and that of all as ``sigma_nm``.
+        float32 µm on the layout's grid, NaN where not valid; and the root mean square of each part as
+        ``sigma_<part>_nm``, and of the whole as ``sigma_nm``.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape
@@ -76,7 +76,7 @@ def _resampling_nm2(
     line_nm: float,
     fast_axis: Axis,
 ) -> float:
-    """What interpolation loses of the print's fine structure: its spectrum without noise times the loss."""
+    """The fine structure that interpolation loses: the print's noise-free spectrum times the loss."""
     filled = fill_gaps(levelled_um)
     lost = 0.0
     axes: tuple[Axis, Axis] = ("y", "x")
@@ -84,7 +84,7 @@ def _resampling_nm2(
         spectrum = psd_along(filled, pitch_um, axis)
         white_nm2 = pixel_nm**2 + (line_nm**2 if axis != fast_axis else 0.0)
         error = np.interp(spectrum.frequency_per_um, *transfer_error(pitch_um, layout_pitch_um))
-        # A density is one-sided: white noise of variance s² has 2 s² times the pitch.
+        # The density is one-sided: that of white noise of variance s² is 2 s² times the pitch.
         lost += float(((spectrum.density - 2 * pitch_um * white_nm2) * error).sum()) * float(
             spectrum.frequency_per_um[0]
         )

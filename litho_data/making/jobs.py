@@ -23,9 +23,9 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Rim of level 0 around a field that is alone on the substrate: models extend the edge of a layout.
+# Rim of level 0 around a field that is alone on the substrate, as models extend the edge of a layout.
 _BARE_PX = 2
-# What a micrograph shows so deep within film or gap of its layout, px, is dirt or a pit.
+# Film or ground that a micrograph shows this deep, px, inside the opposite of its layout is dirt or a pit.
 _DIRT_PX = 5
 
 
@@ -52,14 +52,14 @@ class Skipped:
 
 
 def piece_of(steps: Sequence[Done], **said: Any) -> Piece:
-    """The piece that these steps made, with what else its record says."""
+    """The piece that these steps made, with further facts for its record."""
     record = {**said, "steps": [done.step.to_record() for done in steps], "software": software_record()}
     arrays = {name: array for done in steps for name, array in done.arrays.items()}
     return Piece(json.loads(json.dumps(record)), arrays)
 
 
 def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
-    """Run a job and keep its piece, whose record is returned: arrays stay where they are made.
+    """Run a job, keep its piece and return the record of the piece; arrays stay where they are made.
 
     Bad input becomes a reason for skipping, so one bad file never stops a build.
     """
@@ -92,7 +92,7 @@ class FieldJob:
         return self.field.id
 
     def key(self) -> str:
-        """Hash of everything that decides the piece."""
+        """Hash of everything that determines the piece."""
         one = self.field
         described = [
             one.id,
@@ -111,7 +111,7 @@ class FieldJob:
         return record_sha256([*plan, files, code])
 
     def layout(self) -> Array | None:
-        """Levels of its layout; None if there is none that can be read."""
+        """Levels of its layout; None if it has no layout that can be read."""
         try:
             done = self._read_layout()
         except InputError:
@@ -126,7 +126,7 @@ class FieldJob:
         return OPERATIONS["read-scan"].run(self._read_params, file, {})
 
     def calibrate(self) -> Done | None:
-        """The scales of the microscope, None without standards; InputError if these do not show them."""
+        """The scales of the microscope, None without standards; InputError if these cannot be measured."""
         if not self.standards.described:
             return None
         described = {"standards": [dict(one) for one in self.standards.described]}
@@ -135,7 +135,7 @@ class FieldJob:
     def register_params(self, pitch_um: Sequence[float], fast_axis: str | None) -> dict[str, Any]:
         """Parameters of a registration of scans with this (y, x) pitch."""
         pitches = {"scan_pitch_um": pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
-        lines = {"fast_axis": "y"} if fast_axis == "y" else {}  # otherwise the lines are rows
+        lines = {"fast_axis": "y"} if fast_axis == "y" else {}  # if unknown, the lines are taken as rows
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 
     def run(self) -> Piece:
@@ -171,7 +171,7 @@ class FieldJob:
         )
 
     def _steps(self) -> Iterator[Done]:
-        """The operations in order; each takes what it needs of the arrays of those before it."""
+        """The operations in order; each takes the arrays that it needs from the operations before it."""
         held: dict[str, Array] = {}
 
         def kept(done: Done) -> Done:
@@ -191,7 +191,7 @@ class FieldJob:
             pitch_um = scaled_pitch_um(pitch_um, scales.facts)
         pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
-        # What lies around a field is not in its layout: its outermost pixels are no evidence.
+        # The layout does not show what lies around the field, so the outermost pixels are no evidence.
         aside = {"edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else {}
         register_params = self.register_params(pitch_um, read.facts["fast_axis"])
         if self._is_micrograph:
@@ -206,7 +206,7 @@ class FieldJob:
             return
         recipe = dict(self.recipe)
         if layout is None or (self.field.use != "dataset" and not np.ptp(held["mask_level"])):
-            # A reference has none, or one that shows nothing by which it could be located.
+            # A reference has no layout, or a flat one that cannot be located.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             yield made("locate", register_params)
@@ -251,7 +251,7 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        # What the table says of a scan has to agree with its file.
+        # Facts from the table must agree with the file; those from the card are only defaults.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# Beyond it, the message of a failed registration asks whether rows are missing.
+# Beyond this pixel aspect, the message of a failed registration asks whether rows are missing.
 _OBLONG = 0.01
 
 
 OPERATIONS: dict[str, Operation] = {}
 READERS = ("read-scan", "read-micrograph")
-"""Of what the microscope wrote."""
+"""The operations that read what the microscope wrote."""
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
-    """Make a function the operation of that name; its result depends on ``code`` and this file."""
+    """Register a function as the operation of that name; its result depends on ``code`` and this file."""
 
     def made(function: Function) -> Function:
         OPERATIONS[name] = Operation(
@@ -43,7 +43,7 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """A levelling recipe in canonical form; without a file, the one that cannot ruin a print."""
+    """A levelling recipe in canonical form; without a file, the recipe that cannot ruin a print."""
     from litho_data.level import Recipe
 
     return (Recipe.from_dict(_PLANE) if path is None else Recipe.from_toml(path)).canonical()
@@ -103,7 +103,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Edges of the film; the height that they stand for is what is registered."""
+    """Edges of the film, as the height map that will be registered."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -117,7 +117,7 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
-    """The film on the layout's grid: its height times the share of a pixel that it covers, without dirt."""
+    """The film on the layout's grid without dirt: its height times the share of each pixel that it covers."""
     from litho_data.making.contour import coverage, foreign
     from litho_data.register.refine import interior_of
 
@@ -138,7 +138,7 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("calibrate", "", "readers", "roughness", "making/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
-    """Scales of the microscope, from scans of what has a known size."""
+    """Scales of the microscope, from scans of standards of known size."""
     from litho_data.making.calibration import SCALES, measure_scales
 
     found = measure_scales(params["standards"], files)
@@ -251,7 +251,7 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _on_layout(scan_map: Array, params: Params, arrays: Inputs) -> tuple[Array, Array]:
-    """A map of the scan's frame at the layout's pixels, and where it is known."""
+    """A map from the scan's frame at the layout's pixels, and where it is known."""
     from litho_data.register import Bend, resample_to_layout
 
     pitch_um = tuple(params["scan_pitch_um"])

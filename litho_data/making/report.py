@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from litho_data.making.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
-# Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
+# Blur of the layout in pictures of the residual, about the width of the printer's line; no model uses it.
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",
@@ -31,7 +31,7 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
-# By table the columns in their order, each with its title and what it means.
+# The columns of each table in order, each with its title and meaning.
 _COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
 
 
@@ -84,7 +84,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and why; `--strict` refuses to build without them"
+        caption = "Ids that are not in the store, and why; with `--strict` the build is refused instead"
         page.table(rows, caption, "left_out.csv")
 
 
@@ -92,7 +92,7 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
     if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
         page.heading("Passed with a note", folded=True)
         alike = quality[warned].groupby("warning", sort=False)["scan"].agg(", ".join).reset_index()
-        page.table(alike, "What to know about these scans", "warnings.csv")
+        page.table(alike, "Notes on these scans", "warnings.csv")
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
@@ -116,7 +116,7 @@ def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
         page.heading("What the grating says about the microscope")
         page.table(
             [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
-            "Scales, unevenness of a line and tip, from the known period of the grating; no other scan is "
+            "Scales, bow of a line and tip, from the known period of the grating; no other scan is "
             "corrected by them",
             "gratings.csv",
             digits=4,
@@ -158,7 +158,7 @@ def _stages(store: Store, scan_id: str) -> list[Array]:
 
 
 def _raw(store: Store, scan_id: str) -> Array:
-    """Heights in nm or, of a micrograph, grey values."""
+    """Heights in nm, or the grey values of a micrograph."""
     if store.instrument == "sem":
         return store.scan_frame(scan_id, "micrograph").astype(float)
     return store.scan_frame(scan_id, "raw_height_um") * 1e3

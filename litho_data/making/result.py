@@ -18,7 +18,7 @@ class LeftOut(Record):
 class BuildResult(Result):
     """What a build made and what it left out; ``reused`` scans were finished by an earlier build.
 
-    ``findings``: what is to be done, worst first.
+    ``findings``: what should be done, worst first.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"

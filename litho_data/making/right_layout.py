@@ -1,7 +1,7 @@
-"""Is a scan the print of its own layout? What ids, files and doses got mixed up says itself in a set.
+"""Is a scan the print of its own layout? A whole set shows which ids, files and doses were mixed up.
 
-A scan that registers may still show another layout like its own, a mirrored one, or the same layout at
-another dose. One that does not register may show another layout of the set.
+A scan that registers may still show a similar layout, a mirrored one, or its own layout at another dose. A
+scan that does not register may show another layout of the set.
 """
 
 from collections import Counter
@@ -21,27 +21,27 @@ from litho_data.register.topography import pearson, predicted_topography, remove
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
-# What lies around a field shows in this many of its outermost pixels.
+# Number of outermost pixels that are affected by what lies around a field.
 _EDGE_PX = 2
 # Another layout must explain a scan this much better, in correlation.
 _BETTER = 0.02
-# Correlations by matrix products in float32 are right to this; so many scans are in one product.
+# Error of correlations by matrix products in float32; scans per product.
 _ROUNDING, _AT_ONCE = 1e-3, 64
 # A print of another layout reaches 0.3 to 0.5 at its best shift, one of this layout 0.9.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
-# Scatter of the gain among prints of one layout at one dose, and among those of different layouts.
+# Scatter of the log gain at one dose among prints of one layout, and among those of different layouts.
 _SCATTER_SAME, _SCATTER_OTHER = 0.01, 0.03
 _CLEAR_SIGMA = 4.0
 
 
 @dataclass(frozen=True)
 class Print:
-    """One registered scan: its heights and its blurred layout at a few points, and where it belongs.
+    """One registered scan: its heights and its blurred layout at a few points, its orientation and its group.
 
-    ``turned``: whether the card says that it lay turned. ``group`` is what should share a gain: the dose, if
-    the card gives it, or the printed block. ``response`` and ``edge_times`` are those of ``_response`` and
-    ``_edge_times``.
+    ``turned``: whether the card says that the print lay turned. Scans of one ``group`` should share a gain:
+    it is the dose, if the card gives it, or the printed block. ``response`` and ``edge_times`` come from
+    ``_response`` and ``_edge_times``.
     """
 
     id: str
@@ -59,17 +59,17 @@ class Print:
 def prints_of(
     records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, Array]]
 ) -> list[Print]:
-    """The registered scans among these, at a few points.
+    """The registered scans among the records, at a few points.
 
     Args:
-        records: of the scans of a dataset.
-        load: the arrays ``mask_level`` and ``height_um`` of an id.
+        records: records of the scans of a dataset.
+        load: gives the arrays ``mask_level`` and ``height_um`` of an id.
     """
     return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """What speaks against a scan being the print of its own layout, by id; nothing for most sets."""
+    """Signs that a scan does not show its own layout, by id; empty for most sets."""
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -112,7 +112,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     response = _response(topography, height)
     return Print(
         id=record["id"],
-        # Copies: a view would keep the whole.
+        # Copies, because views would keep the whole arrays in memory.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
         response=response,
@@ -126,11 +126,11 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> list[tuple[str, str]]:
-    """Scans that another layout of the set explains better, at the warp that was found for their own."""
+    """Scans that another layout of the set explains better, at the warp found for their own layout."""
     said = []
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
-        # A layout that was printed more than once goes by its first id.
+        # A layout that was printed more than once is named by its first id.
         distinct = list({one.layout: one for one in reversed(alike)}.values())
         place = {one.layout: k for k, one in enumerate(distinct)}
         for one, found in zip(alike, _correlations(alike, distinct), strict=True):
@@ -146,7 +146,7 @@ def _other_layouts(prints: Sequence[Print]) -> list[tuple[str, str]]:
 
 
 def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator[Array]:
-    """Per scan its correlation with each layout, within ``_ROUNDING``: sums over pairs as matrix products."""
+    """Correlations of each scan with each layout, within ``_ROUNDING``, by matrix products."""
     of_layouts = np.stack([one.topography.ravel() for one in layouts]).astype(np.float32)
     of_layouts -= of_layouts.mean(axis=1, keepdims=True)
     squares = of_layouts**2
@@ -163,7 +163,7 @@ def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator
 
 
 def _correlation(one: Print, other: Print) -> float:
-    """Of the heights of one scan with the layout of another."""
+    """Correlation of the heights of one scan with the layout of another."""
     seen = np.isfinite(one.height)
     return pearson(one.height[seen].astype(float), other.topography[seen])
 
@@ -176,7 +176,7 @@ def _orientations(prints: Sequence[Print]) -> list[tuple[str, str]]:
     said = []
     for one in prints:
         if one.turned:
-            # As its card says.
+            # The card says so.
             continue
         if one.dihedral != usual and 2 * count > len(prints):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
@@ -188,7 +188,7 @@ def _orientations(prints: Sequence[Print]) -> list[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
-    """Scans whose height per level fits another group than their own, and groups out of the order of dose."""
+    """Scans whose height per level fits another group better, and doses that are out of order."""
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
@@ -223,12 +223,11 @@ def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
-    """Height per level, µm: the slope of the heights over the blurred layout; and how it grows with the dose.
+    """Slope of the heights over the blurred layout, µm per level; and its growth with the dose.
 
-    Level times dose is the exposure, so that the curve of the heights over the levels tells what a larger
-    dose would do to their slope over g(dose * level): d ln slope / d ln dose = cov(T, T g') / cov(T, g), T
-    the blurred levels. Of a parabola that is one plus the share that its square has in the slope; in a
-    saturated print it is negative.
+    Exposure is level times dose, so the curve g of the heights over the blurred levels T also shows what a
+    larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola
+    that is one plus the share of its square term in the slope; in a saturated print it is negative.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -240,7 +239,7 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
 
 
 def _edge_times(topography: Array, height: Array, slope: float) -> float:
-    """How many times as far the outermost pixels lie from their layout as the others; 0 if unknown.
+    """Deviation of the outermost pixels from the layout, as a multiple of that of the others; 0 if unknown.
 
     ``slope``: height per blurred level, µm.
     """
@@ -255,13 +254,14 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """What is said of the doses that must change places for the height per level to rise with the dose.
+    """Messages for the doses that must be swapped for the height per level to rise with the dose.
 
-    Two may have been swapped, or the order of all turned round.
+    Two doses may have been swapped, or the order of all reversed.
 
     Args:
-        rising: per dose, of those where more dose should raise it: log of the height per level, and scans.
-        scatter: of the log of one scan.
+        rising: for each dose whose prints should rise with more dose: log of the height per level, number of
+            scans.
+        scatter: standard deviation of that log for one scan.
     """
     doses = sorted(rising)
     values = np.array([rising[dose][0] for dose in doses])

@@ -75,7 +75,7 @@ class Operation:
         name: as in the records.
         version: changed whenever the function may give other results.
         function: ``function(params, files, arrays) -> (arrays, facts)``.
-        takes: names of the arrays, in the order in which they are recorded; those that a scan lacks are
+        takes: names of the input arrays, in the order in which they are recorded; those that a scan lacks are
             left out.
         code: files and folders of this package that the result depends on.
     """
@@ -127,7 +127,7 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 def _one_thread() -> Iterator[None]:
     """One thread for numerical libraries: sums do not depend on the cores, and workers do not compete."""
     import cv2
-    import scipy.linalg  # noqa: F401 - has its own BLAS, which must be loaded to be limited
+    import scipy.linalg  # noqa: F401 - has its own BLAS, which can be limited only once it is loaded
     from threadpoolctl import threadpool_limits
 
     threads = cv2.getNumThreads()

@@ -1,4 +1,4 @@
-"""Which recipe levels the scans of a card best: compared on three of them, by what the layout explains."""
+"""Which recipe levels the scans of a card best, compared on three of them by what the layout explains."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ op = "align-rows"
 method = "median-of-differences"
 """,
 }
-"""What is compared, the simplest first."""
+"""The recipes that are compared, the simplest first."""
 _SCANS = 3
-# A recipe has to leave this much less than a simpler one.
+# A recipe must leave less than this times what a simpler one leaves.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
 _LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
@@ -63,10 +63,10 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The recipe that leaves least, and what each leaves of each scan, nm.
+    """The recipe that leaves the smallest residual, and the residual of every recipe and scan, nm.
 
     ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks
-    outside its fit; ``card`` is the written card; ``warned`` maps recipes to what was said of them.
+    outside its fit; ``card`` is the written card; ``warned`` maps recipes to the warnings about them.
     """
 
     recipe: str
@@ -80,9 +80,9 @@ def suggest_recipe(
 ) -> Suggestion:
     """Compare recipes on three scans of a card; write the best, a card that names it, and a page.
 
-    Levelled heights are explained by a free response to the blurred layout, fitted in half of the blocks of
-    16 px. What it leaves in the other half decides: the tilt that a recipe leaves and the print that it takes
-    out both count. A recipe that moves lines whose pixels did not move is not suggested.
+    A free response to the blurred layout is fitted to the levelled heights in half of the blocks of 16 px.
+    Its residual in the other half decides: it contains both the tilt that a recipe leaves and the print that
+    it removes. A recipe that moves lines whose pixels did not move is not suggested.
 
     Args:
         card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
@@ -96,7 +96,7 @@ def suggest_recipe(
     if listing.card.scan.instrument == "sem":
         raise InputError("recipes to compare", got="micrographs", wanted="scans of heights")
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
-    # Three apart; others where one of them cannot be used.
+    # Three scans far apart in the list; others if one of them cannot be used.
     places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()
     places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
@@ -132,7 +132,7 @@ def suggest_recipe(
 
 
 def _best(left_nm: Mapping[str, float]) -> str:
-    """The one that leaves least; a simpler one, which comes first, if it leaves hardly more."""
+    """The recipe that leaves least, or a simpler one, listed before it, that leaves hardly more."""
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
@@ -150,7 +150,7 @@ def _located(job: FieldJob) -> tuple[Array, Array, Sequence[float]]:
 
 
 def _levelled(recipe: str, raw_um: Array, layout: Array, pitch_um: Sequence[float]) -> tuple[Array, str]:
-    """The heights, and what speaks against the recipe; one that cannot be applied leaves them as they are."""
+    """The heights, and objections to the recipe; a recipe that cannot be applied leaves them unchanged."""
     pitch = (float(pitch_um[0]), float(pitch_um[1]))
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
@@ -180,7 +180,7 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
 
 
 def _write_card(card: Path, best: str) -> Path:
-    """The card with the recipe as its ``process.level``; what else it says stays as it was written."""
+    """Write the card with the recipe as its ``process.level``; the rest of its text stays as it was."""
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))
     line = f'level = "{recipe.name}"'
@@ -222,4 +222,4 @@ def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
             shown.append(coloured_png(thumbnail(image), "cividis", *limits(image)))
         rows.append((name, shown))
     columns = [(title, bar) for title in ("raw", *RECIPES)]
-    page.gallery(columns, rows, "Heights before and after each recipe, every picture on a scale of its own.")
+    page.gallery(columns, rows, "Heights before and after each recipe, each picture on its own scale.")

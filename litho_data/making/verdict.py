@@ -1,4 +1,4 @@
-"""Is a dataset good, and if not what is to be done: every number of the card against the heights."""
+"""Is a dataset good, and if not, what should be done? Compares every number of the card with the heights."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -12,21 +12,21 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# So many times the height that the layout says, or that the other prints have: a number is wrong.
+# Ratios of heights to those of the layout, or of the other prints, beyond which a number is wrong.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
-# Scales of the scans that agree with each other but not with 1: the pitch of the card.
+# If the scales of the scans agree with each other but not with 1, the pitch of the card is wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
-# Measured prints lie at 1.1 to 1.5, made ones with a rim as high as the substrate at 2, without it at 6 to 8.
+# Measured prints lie at 1.1 to 1.5; simulated ones at 2 with a rim of substrate, at 6 to 8 without.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
-# What levelling left, as a share of the print's own standard deviation.
+# Largest residual of levelling, as a share of the print's own standard deviation.
 _LEFT = 0.3
 _SHOWN = 12
 
 
 class Weight(IntEnum):
-    """What comes first among the findings."""
+    """The order of the findings: the lowest comes first."""
 
     LAYOUT = 0
     PITCH = 1
@@ -38,7 +38,7 @@ class Weight(IntEnum):
 
 
 class Finding(Record):
-    """One thing to do: the scan it is about, or all, and what speaks against it."""
+    """One thing to do: the scan that it concerns, or all scans, and what is wrong."""
 
     scan: str
     text: str
@@ -49,7 +49,7 @@ class Finding(Record):
 
 
 def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
-    """Scans whose height per level is not of the size of the others', by id, with the reason."""
+    """Scans whose height per level is far from that of the others, by id, with the reason."""
     gains = {one.id: abs(one.response[0]) for one in prints}
     if len(gains) < 3:
         return {}
@@ -66,7 +66,7 @@ def require_heights(prints: Sequence[Print], card: Card) -> None:
     """Refuse a level height that has nothing to do with the prints, like a wavelength in nm.
 
     Raises:
-        InputError: prints a hundred times as high as their layouts say, or as low.
+        InputError: prints a hundred times higher or lower than their layouts say.
     """
     times = _height_times(prints, card)
     if times and not 1 / _IMPOSSIBLE < times < _IMPOSSIBLE:
@@ -86,14 +86,14 @@ def findings(
     skipped: Mapping[str, str],
     card: Card,
 ) -> list[Finding]:
-    """What is to be done, worst first; nothing for a good dataset.
+    """What should be done, worst first; empty for a good dataset.
 
     Args:
-        records: of the dataset's scans.
+        records: records of the dataset's scans.
         prints: their heights at a few points.
-        doubts: what speaks against the layout of a scan, by id.
+        doubts: signs that a scan does not show its layout, by id.
         skipped: why a scan is not in the store, by id.
-        card: whose numbers are compared with the heights.
+        card: its numbers are compared with the heights.
     """
     named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
     named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
@@ -108,7 +108,7 @@ def findings(
 
 
 def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
-    """What speaks against one scan, ``spread_nm`` being the standard deviation of its heights by id."""
+    """What is wrong with one scan; ``spread_nm`` holds the standard deviation of the heights by id."""
     quality = record["quality"]
     for note in record.get("notes", ()):
         yield note, Weight.NOTE
@@ -121,14 +121,14 @@ def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Ite
         yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
     left = quality.get("sigma_levelling_nm", 0.0)
     if left > _LEFT * spread_nm.get(record["id"], np.inf):
-        text = f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
+        text = f"a tilt or bow of {left:.0f} nm remains in its heights: compare recipes with build --suggest"
         yield text, Weight.LEVEL
 
 
 def _of_the_card(
     records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Numbers of the card that all scans together contradict: the scan, or all, what, and how bad."""
+    """Numbers of the card that the scans together contradict: the scan or all scans, the text, the weight."""
     layout = card.layout
     times = _height_times(prints, card)
     if times and not 1 / _TIMES < times < _TIMES:
@@ -165,13 +165,13 @@ def _of_the_card(
 
 
 def _scale(record: Mapping[str, Any]) -> float:
-    """Stretch of a scan onto its layout; 0 if it was not registered."""
+    """Scale factor of a scan onto its layout; 0 if it was not registered."""
     low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
     return float(low * high) ** 0.5 if low * high > 0 else 0.0
 
 
 def _height_times(prints: Sequence[Print], card: Card) -> float:
-    """Height per level of the prints over that of the card; 0 where nothing is known."""
+    """Height per level of the prints divided by that of the card; 0 if it is unknown."""
     gains = [abs(one.response[0]) for one in prints]
     return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0
 
@@ -181,7 +181,7 @@ def _shown(times: float) -> str:
 
 
 def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
-    """The first words of the report: good, or what is to be done, worst first."""
+    """The first words of the report: good, or what should be done, worst first."""
     if not found:
         return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
     shown = " · ".join(str(one) for one in found[:_SHOWN])

@@ -1,4 +1,4 @@
-"""Where the arrays of a scan come from: the recorded steps, told by history and run again by replay."""
+"""Where the arrays of a scan come from: history lists the recorded steps, replay runs them again."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
     """Folder of the raw files of a store; None if they cannot be found.
 
     Raises:
-        InputError: ``data_dir`` is given and is no folder.
+        InputError: ``data_dir`` is given but is no folder.
     """
     if data_dir is not None:
         return require_folder(data_dir)
@@ -183,7 +183,7 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
-    """Arrays in the order in which they are made, each step from the outputs of the steps before it."""
+    """Arrays in the order in which they are made, each from the outputs of earlier steps."""
     made: dict[str, Array] = {}
     for step in steps:
         if step.op not in OPERATIONS:

@@ -25,7 +25,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that has changed since the build: where, and what is wrong there."""
+    """Something that has changed since the build: the place and what is wrong with it."""
 
     where: str
     problem: str
@@ -36,7 +36,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What ``verify`` found. ``notes`` are worth knowing, but no damage."""
+    """What ``verify`` found. ``notes`` are worth knowing but report no damage."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -63,7 +63,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
         require_folder(data_dir)
     findings = [*_guarded(_documents(path)), *_guarded(_missing(path))]
     try:
-        # Not `open_store`, which refuses what has findings.
+        # Not `open_store`, which refuses a store with findings.
         store = Store(open_root(path), path)
         history = read_steps(store)
         manifest = store.manifest
@@ -96,7 +96,7 @@ def _missing(path: Path) -> Iterator[Finding]:
 
 
 def _documents(path: Path) -> Iterator[Finding]:
-    """Metadata documents that are damaged, or differ from their copy in the root document."""
+    """Metadata documents that are damaged or differ from their copy in the root document."""
     documents: dict[str, Any] = {}
     for name, content in read_documents(path, file_names(path)):
         try:
@@ -117,7 +117,7 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """A check whose data cannot be read is a finding, too."""
+    """Turn data that a check cannot read into a finding."""
     try:
         with damaged("what a check needs"):
             yield from check
@@ -126,7 +126,7 @@ def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
 
 
 def _attributes(store: Store) -> Iterator[Finding]:
-    """Attributes of the root, compared with those that follow from the manifest and the arrays."""
+    """Compare the attributes of the root with those that follow from the manifest and the arrays."""
     attributes = dict(store.root.attrs)
     sha256 = attributes.get("dataset_sha256")
     try:
@@ -142,7 +142,7 @@ def _attributes(store: Store) -> Iterator[Finding]:
 
 
 def _tables(store: Store) -> Iterator[Finding]:
-    """The tables compared with their hashes in the manifest, the manifest with its hash in the root."""
+    """Compare the tables with their hashes in the manifest, and the manifest with its hash in the root."""
     manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
     files = read_table(group_of(store.root, "manifest"), "path")
     if record_sha256([manifest, table_sha256(files)]) != store.root.attrs.get("manifest_sha256"):
@@ -153,7 +153,7 @@ def _tables(store: Store) -> Iterator[Finding]:
 
 
 def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
-    """Each step's id compared with its content, and its inputs with the outputs before it."""
+    """Compare each step's id with its content, and its inputs with the outputs before it."""
     raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
     for scan_id, steps in history.items():
         made: dict[str, str] = {}

@@ -20,15 +20,15 @@ _MATLAB_7 = b"MATLAB 7.3 MAT-file"
 _APPLIED = ("scale_factor", "add_offset")
 _MISSING = ("_FillValue", "missing_value")
 _RANGE = ("valid_min", "valid_max", "valid_range")
-# Other attributes with numbers that would change the values, if one knew how.
+# Attributes whose numbers would change the values in an unknown way.
 _UNKNOWN = re.compile(
     r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb|sensitiv|"
     r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
     re.I,
 )
-# Numbers that make heights of counts, as in m counts + b.
+# Numbers that turn counts into heights, as in m counts + b.
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# The same beside an array or above it, where many other numbers stand.
+# The same among the many other numbers beside or above an array.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
     r"(z|heights?|data|values?|topography|add)[ _-]?offset",
@@ -47,7 +47,7 @@ _NO_COORDINATE = b"This is a netCDF dimension but not"
 class Coordinate:
     """Positions along one dimension and the unit that the file states, or a stated length alone.
 
-    ``axis``: which one it is, if the file says so apart from its name.
+    ``axis``: x or y, if the file states it in addition to the name.
     """
 
     values: Array | None
@@ -56,7 +56,7 @@ class Coordinate:
     axis: str = ""
 
     def extent(self, count: int) -> float | None:
-        """From edge to edge; None if it is not known.
+        """Length from edge to edge; None if unknown.
 
         Raises:
             InputError: uneven steps.
@@ -83,12 +83,12 @@ def array_channel(
 ) -> Channel:
     """The channel of a two-dimensional array: [y, x] unless the names of its dimensions say otherwise.
 
-    ``raw`` reads its values, ``around`` is what stands beside and above it. x grows to the right; where the
-    coordinate along y falls, the order of the file is kept all the same.
+    ``raw`` reads its values; ``around`` holds the attributes beside and above it. x grows to the right; the
+    rows keep the order of the file, even if their coordinate falls.
 
     Raises:
-        InputError: attributes that change the values in a way that is not known here, with their names; no
-            real numbers; coordinates at uneven steps.
+        InputError: attributes that change the values in an unknown way, which the message names; values that
+            are no real numbers; coordinates at uneven steps.
     """
     says = {key: _plain(value) for key, value in attributes.items()}
     beside = {key: _plain(value) for key, value in (around or {}).items()}
@@ -139,7 +139,7 @@ def _axes(
 ) -> tuple[tuple[str, str], bool]:
     """The names of y and x, and whether the first index runs along x.
 
-    Dimensions without coordinates take those of their lengths that are called x and y.
+    Dimensions without coordinates take the coordinates called x and y if the lengths match.
     """
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in dims)
     turned = bool((_X.match(first) and not _X.match(second)) or (_Y.match(second) and not _Y.match(first)))
@@ -168,7 +168,7 @@ def _plain(value: Any) -> Any:
 
 
 def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mirrored: bool) -> Loaded:
-    """Missing first, in the numbers of the file; then scale and offset."""
+    """Mark missing pixels in the file's own numbers, then apply scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
     values = np.asarray(raw(), dtype=float)
@@ -198,10 +198,10 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 
 
 def refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Refuse a map with a mask beside it, whose meaning is not known.
+    """Refuse a map that has a mask beside it, because the meaning of the mask is unknown.
 
     Raises:
-        InputError: so it is.
+        InputError: there is a mask of the map's shape.
     """
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="NaN where pixels were not measured, and no mask")
@@ -248,7 +248,7 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str
 
 
 def lines_and_numbers(held: Mapping[str, Array]) -> tuple[dict[str, Coordinate], dict[str, Any]]:
-    """Of arrays by name those along one dimension, as coordinates, and the single values."""
+    """From arrays by name: the one-dimensional ones as coordinates, and the single values."""
     lines = {name: Coordinate(one.ravel().astype(float), None) for name, one in held.items() if _is_line(one)}
     return lines, {name: one.ravel()[0] for name, one in held.items() if one.size == 1}
 

@@ -1,8 +1,8 @@
-"""Other projects' parsers run in a process of their own, within limits of time and memory.
+"""Run other projects' parsers in a child process, within limits of time and memory.
 
-A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. One child
-process per process that reads is started with the first file and kept; only a parser that breaks a limit
-costs a new one.
+A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
+that reads starts one child with its first file and keeps it; a new child is needed only after a parser broke
+a limit.
 """
 
 import atexit
@@ -27,7 +27,7 @@ _MIB = 1 << 20
 # Intact files take a hundredth of this time and a tenth of this memory.
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
-# A busy machine may stretch the computing; only a parser that waits for something reaches this.
+# Waiting time per computing time: a busy machine stays below it, a parser that waits for something does not.
 _WAITING_PER_COMPUTING = 20
 _OUT_OF_MEMORY = 3
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
@@ -36,9 +36,9 @@ _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 def confined(
     read_channels: Callable[[Path], list[Channel]], imports: tuple[str, ...]
 ) -> Callable[[Path], list[Channel]]:
-    """The same function, run in the child process; so is the loading of its channels.
+    """The same function, run in the child process, as is the loading of its channels.
 
-    Where there is no POSIX the function runs in this process.
+    Without POSIX the function runs in this process.
 
     Args:
         read_channels: importable by name; the ``load`` of its channels can be pickled.
@@ -55,7 +55,7 @@ def confined(
 
 
 class _Child:
-    """One child process, started when it is first needed and again after it was ended."""
+    """One child process, started when it is first needed and again after it has ended."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,7 +66,8 @@ class _Child:
         """The function's result.
 
         Raises:
-            InputError: the function's own, or it took too long, needed too much memory, or crashed.
+            InputError: raised by the function, or because it took too long, needed too much memory or
+                crashed.
         """
         size = path.stat().st_size
         computing_s = _COMPUTING_S + _COMPUTING_S_PER_MIB * size / _MIB
@@ -83,7 +84,7 @@ class _Child:
                     f"cannot read {path}", got=self._end(error, computing_s), hint="the file may be damaged"
                 ) from error
             except BaseException:
-                self.stop()  # an answer that nobody waits for must not reach the next file
+                self.stop()  # a late answer must not be taken for that of the next file
                 raise
         if refusal:
             raise InputError(refusal)
@@ -119,7 +120,7 @@ class _Child:
         return f"a parser that crashed (exit code {code})"
 
     def stop(self) -> None:
-        """End the process, if this process started one."""
+        """End the child, if this process started one."""
         if self._process is not None and self._owner == os.getpid():
             self._process.kill()
             self._process.wait()
@@ -128,7 +129,7 @@ class _Child:
 
 
 def serve(descriptor: int) -> None:
-    """What the child does: one function after the other, until its parent is gone."""
+    """What the child does: run one function after another until its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe = Connection(descriptor)
     with suppress(EOFError):
@@ -149,11 +150,11 @@ def serve(descriptor: int) -> None:
 
 @contextmanager
 def _limits(computing_s: float, memory: int) -> Iterator[None]:
-    """The end of the process after this time of computing; MemoryError beyond this many more bytes."""
+    """End the process after this computing time; raise MemoryError if it takes this many more bytes."""
     import resource
 
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
-    with suppress(OSError):  # only Linux tells what is in use
+    with suppress(OSError):  # only Linux tells how much memory is in use
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, unlimited[1]))
     signal.setitimer(signal.ITIMER_PROF, computing_s)

@@ -23,7 +23,7 @@ def export_of(file: Path) -> dict[str, Any]:
     """What the design package wrote about an exported file; empty for other files.
 
     Raises:
-        InputError: the sidecar is that of another file.
+        InputError: the sidecar belongs to another file.
     """
     path = file.with_name(f"{file.name}.json")
     try:
@@ -33,7 +33,7 @@ def export_of(file: Path) -> dict[str, Any]:
     if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):
         return {}
     if says.get("file_sha256") != file_sha256(file):
-        raise InputError(f"layout {file}", got="another file than its sidecar says", wanted=str(path))
+        raise InputError(f"layout {file}", got="a file that its sidecar does not describe", wanted=str(path))
     return says
 
 
@@ -41,7 +41,7 @@ def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
     """Levels of the element alone, uint8 (ny, nx), row 0 on top.
 
     Raises:
-        InputError: a sidecar without what describes the file, or a file that is not as it says.
+        InputError: an incomplete sidecar, or a file that does not match it.
     """
     levels = exported_rows(path, says)[:]
     if marks := says.get("marks"):
@@ -51,7 +51,7 @@ def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
 
 
 def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
-    """The levels of a whole file, marks included; of TIFF and GDS only the rows that are cut out are read.
+    """The levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
 
     Raises:
         InputError: as ``exported_levels``.
@@ -72,13 +72,13 @@ def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
                 return _gwl_levels(path, shape, pitch_um, step_um, says["pedestal_um"], says["slicing_um"])
             case "dxf":
                 return _dxf_levels(path, shape, pitch_um, says["greys"])
-        # The first schema had a step in place of the greys.
+        # The first schema had a step instead of the greys.
         greys = says.get("greys") or (np.arange(says["levels"]) * says["grey_per_level"]).tolist()
         return _image_levels(path, greys)
 
 
 class TiffRows:
-    """The levels on the first page of a TIFF, uint8; of the file only the strips asked for are read."""
+    """The levels on the first page of a TIFF, uint8; only the requested strips are read."""
 
     def __init__(self, path: Path):
         import tifffile
@@ -143,10 +143,10 @@ def _gwl_levels(
     pedestal_um: float,
     slicing_um: float,
 ) -> Array:
-    """Levels uint8 (ny, nx), row 0 on top, from the number of slices that lie above one another.
+    """Levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
 
     Raises:
-        InputError: columns of resist that are no whole number of levels.
+        InputError: columns of resist that are not a whole number of levels high.
     """
     steps = np.zeros((shape[0], shape[1] + 1), np.int32)
     stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
@@ -206,7 +206,7 @@ def read_stl_levels(
     ends = np.array([[np.inf], [-np.inf]]).repeat(len(face), 1)
     for one, other in ((0, 1), (1, 2), (2, 0)):
         low, high = places[face, one], places[face, other]
-        # From the lower end in every face: both faces at an edge meet it at the same number.
+        # Computed from the lower end in every face, so that both faces at an edge get the same number.
         down = (low[:, 1] > high[:, 1])[:, None]
         (x0, y0), (x1, y1) = np.where(down, high, low).T, np.where(down, low, high).T
         met = (y0 <= row + 0.5) & (row + 0.5 < y1)

@@ -12,7 +12,7 @@ from litho_data.foundation.kinds import Array, Shape
 _UNIT_M, _PRECISION_M = 1e-6, 1e-9
 # Side of the blocks that a part is cut into.
 _BLOCK_PX = 128
-# Shapes that are read at once.
+# Number of shapes that are read at once.
 _CHUNK = 1 << 10
 _CELL_NAME, _REFERENCE_NAME, _PLACE, _END_LIBRARY = 0x0606, 0x1206, 0x1003, 0x0400
 
@@ -40,7 +40,7 @@ class GdsRows:
         self._shapes: dict[str, tuple[int, int]] = {}
         self._references: dict[str, list[tuple[str, int, int]]] = {}
         self._index()
-        # Every row of blocks by its lower left corner in pixels.
+        # Every row of blocks, with its lower left corner in pixels.
         self._bands = [
             (round((x + dx) / self._step), round((y + dy) / self._step), cell)
             for name, x, y in self._references["LAYOUT"]
@@ -67,10 +67,10 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Where the shapes of every cell lie in the file, and to which cells it refers."""
+        """Find where the shapes of every cell lie in the file, and which cells it refers to."""
         at, cell, name = 0, "", ""
         while True:
-            # No record but those of shapes is longer.
+            # Only records of shapes are longer.
             part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
             length, kind = struct.unpack(">HH", part[:4])
             body = part[4:length]
@@ -88,7 +88,7 @@ class GdsRows:
             at += length
 
     def _shapes_from(self, at: int) -> int:
-        """How many rectangles follow in the file."""
+        """Number of rectangles that follow in the file."""
         count = 0
         while True:
             start = at + count * _RECTANGLE.itemsize

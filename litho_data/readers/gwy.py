@@ -1,4 +1,4 @@
-"""Gwyddion's own files: every data field is a channel, a mask stays a mask."""
+"""Gwyddion's own files: every data field becomes a channel, and a mask stays a mask."""
 
 import re
 import struct
@@ -121,7 +121,7 @@ def _count(data: bytes, at: int) -> int:
 
 
 def _text(data: bytes, start: int, limit: int) -> tuple[str, int]:
-    """What stands before the closing NUL, and the position after it."""
+    """The text before the closing NUL, and the position after it."""
     end = data.find(b"\0", start, limit)
     if end < 0:
         raise ValueError(f"a string at {start} does not end")

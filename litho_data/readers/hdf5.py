@@ -1,4 +1,4 @@
-"""HDF5 files that say whose they are: JPK's series, Nanosurf's NHF, TopoStats' results; then all others."""
+"""HDF5 files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results), and all others."""
 
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ _JPK = b"JPK SCAN"
 _UM_PER_M = 1e6
 _UM_PER_NM = 1e-3
 _NANOSURF = "nsf_file_version_major"
-# Names of one fact in the versions 2 and 1 of Nanosurf's files.
+# Names of the same fact in versions 2 and 1 of Nanosurf's files.
 _NAMES, _LOW, _HIGH, _UNIT = (
     ("signal_name", "name"),
     ("signal_calibration_min", "base_calibration_min"),
@@ -39,10 +39,10 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 def read_channels(path: Path) -> list[Channel]:
     """JPK, Nanosurf: one channel per signal and direction. TopoStats: the flattened and the raw image, nm.
 
-    Thumbnails, traces of grains and other tables are passed over.
+    Thumbnails, traces of grains and other tables are skipped.
 
     Raises:
-        InputError: damaged file, or one without a map.
+        InputError: a damaged file, or one without a map.
     """
     import h5py
 
@@ -61,7 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
-    """Signals of one measurement: values (pixel, frame), the pixels in the order of ``Position_Indices``."""
+    """Signals of one measurement: values (pixel, frame), with pixels in the order of ``Position_Indices``."""
     grid = {key: measurement.attrs[f"position-pattern.grid.{key}"] for key in ("ilength", "jlength")}
     size_m = [float(measurement.attrs[f"position-pattern.grid.{key}length"]) for key in "vu"]
     shape = int(grid["jlength"]), int(grid["ilength"])
@@ -88,7 +88,7 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
 
 
 def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
-    """Values of the default calibration; y of the grid points up, so its last row comes first."""
+    """Values in the default calibration; y of the grid points up, so its last row comes first."""
     import h5py
 
     with foreign_parser(path, "HDF5"), h5py.File(path) as file:
@@ -119,7 +119,7 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """Counts over the range of their type stand for the calibrated range; rows and columns as stored."""
+    """The range of the counts' type stands for the calibrated range; rows and columns stay as stored."""
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])
         x_m, y_m = (float(one) for one in says.get("rect_axis_range", (0, 0)))

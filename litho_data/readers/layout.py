@@ -24,21 +24,21 @@ def read_layout(
     """Levels of a layout, uint8 (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
-    grey if its colours are identical. A file that the design package exported, of any of its formats, is read
-    by the sidecar beside it.
+    grey if its colours are identical. A file that the design package exported, in any format, is read with
+    the help of the sidecar beside it.
 
     Args:
         path: the file.
         grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
-        levels: how many there are. A picture whose values go beyond them is then taken for one whose white is
-            the highest level, if all its values are steps of it.
-        average_px: of a picture in two greys: the side of the squares of its pixels that become one pixel of
-            the layout, whose level is the number of pixels in the lighter grey; what is left over at right
-            and bottom is cut.
+        levels: number of levels. A picture with larger values is taken as one whose white is the highest
+            level, if all its values are whole steps.
+        average_px: for a picture in two greys: each square of this many pixels a side becomes one pixel of
+            the layout, whose level is the number of lighter pixels in the square; a remainder at right and
+            bottom is cut off.
 
     Raises:
         InputError: no such file, damaged, another format, a true colour image, values that are no levels or
-            no steps of grey, a sidecar of another file.
+            no steps of grey, or the sidecar of another file.
     """
     file = require_file(path)
     if says := export_of(file):

@@ -1,4 +1,4 @@
-"""Missing pixels that a file marks by a number or a word: named by the caller, or asked about."""
+"""Missing pixels that a file marks by a number or a word: the caller names the mark or is asked for it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,12 +12,12 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# A number that no program is known for must stand this many spans of the other values away; one pixel, more.
+# A number that no known program uses must lie this many spans off the other values; a lone pixel, further.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
-# Values are held as float32, and the largest of all written with a few digits.
+# Relative tolerance: values are held as float32, and very large ones are written with few digits.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# One value in so many pixels, where others are rare.
+# Share of the pixels, number, and multiple of the mean count from which an extreme value is suspicious.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
@@ -40,7 +40,7 @@ def without_missing(
     for word, line in channel.words.items():
         if word not in marks:
             shown = f"{word[:24]!r}" if word else "an empty cell"
-            hint = f'if it marks pixels that were not measured: missing = ["{word[:24]}"]'
+            hint = f'if it marks pixels without a measurement: missing = ["{word[:24]}"]'
             raise InputError(f"{file} line {line}", got=shown, wanted="a number", hint=hint)
     values = np.array(values, dtype=float)
     for number in (one for one in missing or () if not isinstance(one, str)):
@@ -49,7 +49,7 @@ def without_missing(
     if missing is None and (found := _marks(values)):
         shown = ", ".join(f"{value:g} in {count} pixels" for value, count in found)
         keys = ", ".join(f"{value:.8g}" for value, _ in found)
-        hint = f"if it marks pixels that were not measured: missing = [{keys}]; if not: missing = []"
+        hint = f"if it marks pixels without a measurement: missing = [{keys}]; if not: missing = []"
         raise InputError(f"{file}: heights", got=f"{shown}, far from all others", wanted="heights", hint=hint)
     return values
 
@@ -72,13 +72,13 @@ def _marks(values: Array) -> list[tuple[float, int]]:
 
 
 def extreme_note(values: Array) -> str:
-    """What to know of a map with one extreme value in many pixels; empty for others."""
+    """A note on a map whose lowest or highest value fills many pixels; empty for others."""
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):
         return ""
     least = max(_FEWEST, _SHARE * counts.sum(), _TIMES * counts.sum() / len(numbers))
     said = [f"{numbers[end]:.6g} in {counts[end]} pixels" for end in (0, -1) if counts[end] >= least]
     what = (
-        f"its {'lowest' if counts[0] >= least else 'highest'} value stands in many pixels ({'; '.join(said)})"
+        f"its {'lowest' if counts[0] >= least else 'highest'} value occurs in many pixels ({'; '.join(said)})"
     )
     return f"{what}: cut off by the instrument, or a mark of missing pixels?" if said else ""

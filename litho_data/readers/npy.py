@@ -38,9 +38,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def read_archive(path: Path) -> list[Channel]:
-    """One channel per two-dimensional array of numbers in an ``.npz`` file; others are passed over.
+    """One channel per two-dimensional array of numbers in an ``.npz`` file; other arrays are skipped.
 
-    Single values and lines beside them tell the unit and the axes, as in a file of MATLAB.
+    Single values and one-dimensional arrays beside them give the unit and the axes, as in a MATLAB file.
 
     Raises:
         InputError: damaged file.
@@ -97,7 +97,7 @@ def load_array(path: Path) -> Array:
 
 
 def _is_archive(head: bytes) -> bool:
-    """Whether the first file in a ZIP is an array; its name stands behind a header of 30 bytes."""
+    """Whether the first file in a ZIP is an array; its name follows a header of 30 bytes."""
     length = int.from_bytes(head[26:28], "little")
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 

@@ -15,13 +15,13 @@ _GZIP = b"\x1f\x8b"
 _SURF, _PACKED_SURF = b"DIGITAL SURF", b"DSCOMPRESSED"
 _MOST_BYTES = 1 << 30
 _PIECE = 1 << 20
-# In Digital Surf's header: the sizes of comment and private zone that follow its 512 bytes.
+# Place of the sizes of comment and private zone, which follow the 512 bytes of Digital Surf's header.
 _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """The file itself, or a temporary file with what a packed one holds; messages name the packed one.
+    """The file itself, or a temporary file with the unpacked content; messages name the packed file.
 
     Raises:
         InputError: damaged, or more than 1 GiB inside.
@@ -54,7 +54,7 @@ def _unpack_gzip(path: Path, content: Path) -> None:
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
-    """Header, comment and private zone as they are; then a count, the sizes of the streams, the streams."""
+    """Copy header, comment and private zone; then come a count, the sizes of the streams, and the streams."""
     raw = path.read_bytes()
     start = _SURF_HEADER + sum(struct.unpack_from("<2H", raw, _SURF_ZONES))
     (count,) = struct.unpack_from("<I", raw, start)

@@ -16,7 +16,7 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
 
     Args:
         path: the file.
-        what: it is, for messages.
+        what: what messages call the file.
 
     Raises:
         InputError: no such file, damaged, another format, a true colour image, numbers that are not finite.

@@ -27,7 +27,7 @@ from litho_data.scan import Axis, Scan
 _NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
-# Sides of a scan that coordinates without a unit may have.
+# Possible sides of a scan, for coordinates without a unit.
 _SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
@@ -47,7 +47,7 @@ def read_scan(
 
     Args:
         path: the instrument's file.
-        format: one of ``formats()``, or ``"auto"``, which judges the content.
+        format: one of ``formats()``, or ``"auto"`` to detect it from the content.
         unit: of the heights, needed if the file states none.
         size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
             pitch stays unknown (None).
@@ -55,14 +55,14 @@ def read_scan(
         fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
         full_scale_um: height of the largest integer value, for images that hold integers:
             height = value / largest value · full_scale_um. Replaces ``unit``.
-        missing: numbers (as in the file) and words that mark pixels which were not measured, besides those
-            that the file states; an empty list says that there are none.
-        defaults: ``unit`` and ``size_um`` hold for many files, and only where a file states none; otherwise
-            they must not contradict it.
+        missing: numbers (as in the file) and words that mark pixels without a measurement, besides those that
+            the file states; an empty list says that there are none.
+        defaults: ``unit`` and ``size_um`` apply only if the file states none. Without ``defaults`` they must
+            not contradict the file.
 
     Raises:
-        InputError: unreadable, no or several height channels, a missing or contradicting unit or
-            size, what looks like a mark of missing pixels and is not named, nothing finite in the map.
+        InputError: an unreadable file, no or several height channels, a missing or contradicting unit or
+            size, a value that looks like an unnamed mark of missing pixels, or no finite value.
     """
     with unpacked(require_file(path)) as file:
         reader = _settle_format(file, format)
@@ -106,7 +106,7 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
         channels = _read_channels(_settle_format(file, format), file)
     if file == given:
         return channels
-    # The unpacked file is gone by the time when a channel is loaded.
+    # The unpacked file is gone by the time a channel is loaded.
     return [replace(one, load=partial(_load_packed, given, format, one.name)) for one in channels]
 
 
@@ -184,7 +184,7 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """Scaled to µm; a factor below one is applied as a division, so that 100 nm is 0.1 µm exactly."""
+    """The values in µm; a factor below one is applied as a division, so that 100 nm is exactly 0.1 µm."""
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
 
@@ -201,7 +201,7 @@ def _settle_pitch(file: Path, channel: Channel, size_um: YX | None, unit: str) -
 
 
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
-    """(y, x) in µm of coordinates without a unit: µm or that of the heights, whichever alone makes sense."""
+    """(y, x) in µm of coordinates without a unit: in µm or in the heights' unit, if only one makes sense."""
     if channel.extent is None or channel.full_scale is not None:
         return None
     sizes = {(channel.extent[0] * factor, channel.extent[1] * factor) for factor in (1.0, um_per(unit))}

@@ -21,12 +21,12 @@ from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
 _MAX_PIXELS = 2**28
-# Deflate, the strongest compression in use.
+# The limit of Deflate, the strongest compression in use.
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
-# What parsers say of a file that was cut off or changed; all else is a kind that they do not know.
+# What parsers say about a truncated or changed file; any other message is about an unknown kind of file.
 _CUT = re.compile(
     r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
     r"crc|incomplete|reach(es)? beyond",
@@ -45,17 +45,17 @@ class Channel:
     Args:
         name: unique within the file.
         shape: (ny, nx) in pixels.
-        unit: of the values, as the file states it; None if it does not.
+        unit: unit of the values as the file states it; None if it does not.
         size_um: (y, x) extent from edge to edge; None if the file does not state it.
         load: returns the values, (ny, nx) in ``unit``, row 0 on top, and the file's mask or None.
         full_scale: the largest value of an integer image; None for real numbers.
-        fast_axis: None if the file does not state it.
+        fast_axis: axis along which the tip moved; None if the file does not state it.
         header: everything that the file states, as strings.
         problem: why the channel cannot be read; empty if it can.
-        x_is: what of the file runs along x, in words.
+        x_is: in words, what in the file runs along x.
         extent: (y, x) from edge to edge in a unit that the file does not state.
-        words: what stands in place of numbers, and the first line with it; those pixels are NaN.
-        notes: what a reader should know who trusts the map.
+        words: words in place of numbers, each with its first line; their pixels are NaN.
+        notes: warnings for whoever uses the map.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Whether the unit is a length, or only the caller can know it."""
+        """Whether the unit is a length, or is left to the caller."""
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
@@ -110,7 +110,7 @@ class Reader:
 
 
 def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
-    """The channel, or one that says why it cannot be read, so that it takes no other with it."""
+    """The channel, or one that says why it cannot be read, so that the other channels stay usable."""
     try:
         with foreign_parser(path, kind):
             return make()
@@ -123,7 +123,7 @@ def _refuse(problem: str) -> Loaded:
 
 
 def in_memory(values: Array) -> Callable[[], Loaded]:
-    """What loads a map that has been read already."""
+    """A loader for a map that has been read already."""
     return partial(_copied, values)
 
 
@@ -132,7 +132,7 @@ def _copied(values: Array) -> Loaded:
 
 
 def extent_um(y: float, x: float, unit: str | None) -> YX | None:
-    """(y, x) in µm of an extent as a file states it; None without a length of two positive numbers."""
+    """(y, x) in µm of a stated extent; None unless both are positive and the unit is a length."""
     if unit is None or not is_length(unit):
         return None
     size = float(y) * um_per(unit), float(x) * um_per(unit)
@@ -156,7 +156,7 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
-    """Without warnings, and with nothing from these loggers up to a level."""
+    """Silence warnings, and these loggers up to a level."""
     named = [logging.getLogger(name) for name in loggers]
     levels = [logger.level for logger in named]
     try:

@@ -1,4 +1,4 @@
-"""The formats that are read, and which of them a file has, by its content and never by its suffix."""
+"""The formats that can be read; the format of a file follows from its content, never from its suffix."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, sxm, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
-# In the order in which they are asked: formats that sign their files first, then the containers and texts
-# that anybody writes.
+# In the order in which they are tried: formats with a signature first, then containers and texts that any
+# program writes.
 _READERS = [
     gsf.READER,
     gwy.READER,
@@ -34,13 +34,13 @@ def formats() -> tuple[str, ...]:
 
 
 def register_reader(reader: Reader) -> Reader:
-    """Read files of another format from now on; a new reader is asked before the existing ones.
+    """Register a reader of another format; it is tried before the existing ones.
 
     To build in several processes, call this in a plug-in, or in the script that starts the build, at its top
     level.
 
     Raises:
-        InputError: there is a format of that name.
+        InputError: a format of that name exists.
     """
     if reader.name in ("auto", PICTURE, *formats()):
         raise InputError("reader to register", got=f"{reader.name!r}, which exists", wanted="another name")
@@ -61,7 +61,7 @@ def reader_of(format: str) -> Reader:
 
 
 def detect_format(path: Path) -> str:
-    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP, pictures at most.
+    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP.
 
     Raises:
         InputError: none does.

@@ -10,7 +10,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
-# As float32, and as written with six digits.
+# The blank value as float32, and as written with six digits.
 _BLANK = 1.7014e38
 _GRID = struct.Struct("<2i8d")
 
@@ -19,7 +19,7 @@ def read_channels(path: Path) -> list[Channel]:
     """The one grid; its coordinates are those of the pixel centres, in a unit that the file does not state.
 
     Raises:
-        InputError: damaged.
+        InputError: a damaged file.
     """
     raw = path.read_bytes()
     read = {b"DSAA": _text, b"DSBB": _binary_6, b"DSRB": _binary_7}.get(raw[:4])
@@ -57,7 +57,7 @@ def _binary_6(raw: bytes) -> tuple[Array, float, float, float]:
 
 
 def _binary_7(raw: bytes) -> tuple[Array, float, float, float]:
-    """Sections of tag, size and content; GRID holds the geometry and DATA, after it, the heights."""
+    """Sections of tag, size and content: GRID holds the geometry, and DATA after it the heights."""
     position, grid = 0, None
     while position < len(raw):
         tag, size = struct.unpack_from("<4si", raw, position)

@@ -18,12 +18,12 @@ _ITEM, _ORDERS = 4, {"MSBFIRST": ">f4", "LSBFIRST": "<f4"}
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per signal and direction; what was scanned backward is turned to run along x.
+    """One channel per signal and direction; backward scans are mirrored to run along x.
 
     Pixels of an unfinished scan are NaN in the file.
 
     Raises:
-        InputError: a header without what describes the images, or fewer images than it describes.
+        InputError: a header that does not describe the images, or fewer images than it describes.
     """
     raw = path.read_bytes()
     end = raw.find(_END)

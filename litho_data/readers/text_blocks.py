@@ -12,28 +12,28 @@ from litho_data.foundation.kinds import YX, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.reader import DAMAGED
 
-# No two neighbouring repetitions of these expressions match the same characters: otherwise a long line of
-# blanks or digits takes hours.
+# In these expressions, no two neighbouring repetitions match the same characters; otherwise a long line of
+# blanks or digits would take hours.
 NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf(inity)?", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
 # A semicolon may also stand before the first cell of a row.
-# A spreadsheet's errors begin like one.
+# Error cells of a spreadsheet begin like a comment.
 _COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _LOOKED_AT = 400
 _FEWEST_NULS = 0.8
-# As many equal words in a line are a row in which nothing was measured.
+# This many equal words in a line are a row of missing pixels.
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
-# Letters and digits alone of a key are compared.
+# Keys are compared by their letters and digits only.
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 _KEYS: dict[str, list[str]] = WORDS["keys"]
-# The unit of a column or of all numbers, as in "Height [nm]"; before a number it is that of a length.
+# The unit of a column or of all numbers, as in "Height [nm]"; before a number it belongs to a length.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
     r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
@@ -55,7 +55,7 @@ _SCALE_IN_WORDS = re.compile(
 
 @dataclass
 class Block:
-    """Neighbouring lines of numbers: the header above them, and the number of the first one in the file."""
+    """Neighbouring lines of numbers, the header above them, and the line number of the first."""
 
     header: dict[str, str]
     words: list[str]
@@ -63,18 +63,18 @@ class Block:
     rows: list[str] = field(default_factory=list)
 
     def first(self, *keys: str) -> str:
-        """What the header says under the first of the words for these keys; empty if nothing."""
+        """The header's value for the first of these keys that it contains; empty if it contains none."""
         lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
         return next((lower[name] for key in keys for name in _KEYS.get(key, [key]) if name in lower), "")
 
     @property
     def name(self) -> str:
-        """Of the channel, if the header gives one."""
+        """Name of the channel, if the header gives one."""
         return self.first("channel")
 
     @property
     def unit(self) -> str | None:
-        """Of the values; None if the header states none."""
+        """Unit of the values; None if the header states none."""
         if self.factor is not None:
             return "m"
         titled = [unit for text in self.words for unit in _TITLED.findall(text[:200])]
@@ -86,7 +86,7 @@ class Block:
         """Compare the numbers of rows and columns with what the header states.
 
         Raises:
-            InputError: it states others.
+            InputError: the header states other numbers.
         """
         for count, what in zip(shape, ("rows", "columns"), strict=True):
             stated = self.first(what)
@@ -95,10 +95,10 @@ class Block:
 
     @property
     def factor(self) -> float | None:
-        """From values to metres, where the header gives it.
+        """Factor from values to metres, if the header gives one.
 
         Raises:
-            InputError: the header gives another scale, which is not known here.
+            InputError: the header gives a scale of an unknown kind.
         """
         if NUMBER.match(self.header.get(_TO_METRES, "")):
             return number(self.header[_TO_METRES])
@@ -112,12 +112,12 @@ class Block:
 
     @property
     def missing(self) -> list[float]:
-        """The numbers that the header says mark missing pixels."""
+        """The numbers that mark missing pixels according to the header."""
         stated = self.first("missing")
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
-        """From the two sides, or from the size of a pixel."""
+        """(y, x) from the two sides, or from the size of a pixel, µm."""
         if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(side)) for side in ("height", "width")]
@@ -125,10 +125,10 @@ class Block:
 
 
 def refuse_scales(header: Mapping[str, str]) -> None:
-    """Refuse a header with a scale, which no format of these words gives.
+    """Refuse a header with a scale that no known format uses.
 
     Raises:
-        InputError: it has one.
+        InputError: the header has such a scale.
     """
     for key, value in header.items():
         if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):
@@ -136,10 +136,11 @@ def refuse_scales(header: Mapping[str, str]) -> None:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, lines apart by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western Europe.
+    """The text of a file, lines separated by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western Europe.
 
     Raises:
-        InputError: UTF-16 with a part of a character, or bytes that are no text; the message names the line.
+        InputError: UTF-16 with an incomplete character, or bytes that are no text; the message names the
+            line.
     """
     raw = path.read_bytes()
     halves = {"utf-16-be": raw[:_LOOKED_AT:2], "utf-16-le": raw[1:_LOOKED_AT:2]}
@@ -170,13 +171,13 @@ def without_quotes(text: str) -> str:
 def blocks_of(text: str) -> list[Block]:
     """The blocks of numbers in a text; blank lines and lines of words end a block.
 
-    A line of words counts as one only if less than half of its cells are numbers: otherwise it is a row of
-    the block, with words in place of numbers. Where every other line is blank, all rows are one block.
+    A line counts as words only if less than half of its cells are numbers; otherwise it is a row of the
+    block, with words in place of numbers. If every other line is blank, all rows are one block.
     """
     found = list(_blocks(text))
     if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):
         for one in found[1:]:
-            # Blank lines keep the numbers of the lines right.
+            # Blank lines keep the line numbers right.
             found[0].rows += [""] * (one.first_line - found[0].first_line - len(found[0].rows)) + one.rows
         return found[:1]
     return found
@@ -200,7 +201,7 @@ def _blocks(text: str) -> Iterator[Block]:
 
 
 def header_of(text: str) -> Block:
-    """What lines of words say, without numbers below them."""
+    """The header made of lines of words, without numbers below them."""
     block = Block({}, [], 0)
     for number_of_line, line in enumerate(text.splitlines(), start=1):
         block.words.append(line.strip())
@@ -209,9 +210,9 @@ def header_of(text: str) -> Block:
 
 
 def is_row(line: str) -> bool:
-    """Whether a line is one of numbers: no comment, and at least half of its cells are.
+    """Whether a line is a row of numbers: it is no comment, and at least half of its cells are numbers.
 
-    A line of one word again and again, which is no unit, is a row of missing pixels.
+    A line that repeats one word, which is no unit, is a row of missing pixels.
     """
     if _COMMENT.match(line) or not line.strip():
         return False
@@ -229,7 +230,7 @@ def is_row(line: str) -> bool:
 
 
 def cells_of(line: str) -> list[str]:
-    """The cells of a line, apart by blanks, tabs, commas or semicolons."""
+    """The cells of a line, separated by blanks, tabs, commas or semicolons."""
     return _SEPARATORS.split(line.strip(" \t,;"))
 
 

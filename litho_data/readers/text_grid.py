@@ -1,4 +1,4 @@
-"""Coordinates in a table of numbers: axes in its first row and column, or points that make a whole grid."""
+"""Coordinates in a table of numbers: axes in the first row and column, or points that fill a grid."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from litho_data.foundation.units import is_length, um_per
 # Coordinates are written with few digits: a step may be off by this share of the usual one.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# One axis alone, or uneven ones, need more numbers.
+# A single axis or uneven axes need more numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -27,9 +27,9 @@ _AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 on top, x to the right, and what the table said of lengths; ``extent`` has no unit.
+    """Heights with row 0 on top, x to the right, and the lengths in the table; ``extent`` has no unit.
 
-    ``corner``: whether the first cell was that of axes."""
+    ``corner``: whether the first cell belonged to axes."""
 
     values: Array
     extent: YX | None = None
@@ -42,12 +42,13 @@ class Map:
 def without_axes(values: Array, words: Sequence[str]) -> Map:
     """The matrix without a first row or column of coordinates or counts.
 
-    Evenly spaced numbers that the neighbouring line does not continue are coordinates: neighbouring lines of
-    a map are alike. Numbers of 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing of lengths.
+    Evenly spaced numbers are coordinates if the neighbouring line is not like them, because neighbouring
+    lines of a map are alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing about
+    lengths.
 
     Raises:
-        InputError: a first row and column that look like coordinates at uneven steps, a last row and column
-            that look like coordinates.
+        InputError: a first row and column that look like coordinates at uneven steps, or a last row and
+            column that look like coordinates.
     """
     body = values[1:, 1:]
     if min(body.shape) <= _FEWEST_STEPS:
@@ -70,7 +71,7 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
         raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even ones")
     ends = ((values[-1, :-1], values[-2, :-1]), (values[:-1, -1], values[:-1, -2]))
     if all((step := _spacing(line)) and not _goes_on(beside, step) for line, beside in ends):
-        raise InputError("axes in the last row and column", wanted="them in the first ones, or left out")
+        raise InputError("axes in the last row and column", wanted="axes in the first ones, or none")
     return Map(values)
 
 
@@ -107,7 +108,7 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 
 
 def _columns(words: Sequence[str], count: int) -> list[int]:
-    """The columns of x, y and z, by the words above them; the only three if these do not say, else none."""
+    """The columns of x, y and z by the words above them, or the only three columns; otherwise none."""
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))
         axes = [found[0] or "z" if (found := _AXIS.match(name)) else "" for name in names]
@@ -119,8 +120,8 @@ def _columns(words: Sequence[str], count: int) -> list[int]:
 def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     """The map of points that fill a regular grid; None if they do not.
 
-    Their columns are x, y, z unless words say otherwise. The rows are in the order in which the
-    file has them, x grows to the right. Grid points that the file does not have are missing pixels.
+    The columns are x, y, z unless words say otherwise. The rows keep the order of the file; x grows to the
+    right. Grid points that the file lacks are missing pixels.
     """
     columns = _columns(words, points.shape[1])
     if not columns:

@@ -1,4 +1,4 @@
-"""Height maps as text: matrices, with axes, several in a file, points of a grid; read and written."""
+"""Height maps as text: one or several matrices, with or without axes, or the points of a grid."""
 
 import re
 from functools import partial
@@ -14,7 +14,7 @@ from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# Few numbers in a row of a long table are a point, not a line of a map.
+# A few numbers per row of a long table are points, not lines of a map.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
 _IGOR = "IGOR\n"
 
@@ -95,11 +95,11 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
     """
     if not np.isfinite(height_um).all():
         raise InputError("height in a text matrix", got="NaN or infinity", wanted="finite numbers")
-    # No minus before a zero.
+    # Avoids -0.
     metres = (height_um * 1e-6 + 0.0).ravel().tolist()
     row = "\t".join(["%.4e"] * height_um.shape[1]) + "\r\n"
     text = row * len(height_um) % tuple(metres)
-    # Exponents of three digits, as the programs of microscopes write them.
+    # Exponents have three digits, as microscope programs write them.
     Path(path).write_bytes(text.replace("e-", "e-0").replace("e+", "e+0").encode())
 
 
@@ -132,7 +132,7 @@ def _refuse_points(path: Path) -> None:
 
 
 def _start_of_text(head: bytes) -> str:
-    """The beginning as text, empty for bytes that are none."""
+    """The beginning as text; empty if the bytes are not text."""
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return head[: len(head) // 2 * 2].decode("utf-16", errors="ignore")
     if b"\0" in head:

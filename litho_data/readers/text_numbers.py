@@ -61,17 +61,17 @@ def _numbers(path: Path, text: str, first_line: int) -> Table:
 
 
 def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
-    """The text with decimal points, and what its cells are apart by; None for blanks.
+    """The text with decimal points, and the separator of its cells; None for blanks.
 
-    Commas separate cells only if nothing else does; otherwise they are decimal commas, and then there is no
-    decimal point in the file.
+    Commas separate cells only if nothing else does; otherwise they are decimal commas, and the file has no
+    decimal points.
 
     Raises:
-        InputError: cells apart by commas and by something else, as in ``1,234.5;2,345.6``; commas that may be
-            decimal ones between cells apart by commas, or marks of thousands.
+        InputError: commas beside another separator, as in ``1,234.5;2,345.6``; commas that may be decimal
+            commas as well as separators; or commas that may separate thousands.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
-    for mark in "\t;,":  # at the ends of all rows it is apart from nothing
+    for mark in "\t;,":  # at the end of every row it separates nothing
         if all(row.endswith(mark) for row in rows if row):
             rows = [row[:-1] for row in rows]
         if all(row.startswith(mark) for row in rows if row):
@@ -89,7 +89,7 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
             for line, row in enumerate(tight.split("\n"), start=first_line):
                 if "," in row and _OTHER_SEPARATOR.search(row.strip()):
                     got = repr(row.strip()[:_SHOWN_CHARACTERS])
-                    wanted = "cells apart by one separator, and no marks of thousands"
+                    wanted = "cells with one separator, and no marks of thousands"
                     raise InputError(f"{path} line {line}", got=got, wanted=wanted)
         else:
             parts = _AT_COMMA.findall(text)
@@ -113,7 +113,7 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
 
 
 def _refuse_decimal_commas(path: Path, text: str, first_line: int) -> None:
-    """In ``0,9000,0,3100`` every second cell has the same number of digits, and no other cell has."""
+    """Refuse rows like ``0,9000,0,3100``: every second cell, and no other, has the same number of digits."""
     if "." in text:
         return
     rows = [row.split(",") for row in text.split("\n") if row]
@@ -133,7 +133,7 @@ def _cell_by_cell(path: Path, text: str, separator: str | None, first_line: int)
     ]
     width = max(len(cells) for _, cells in rows[1:]) if len(rows) > 1 else len(rows[0][1])
     if len(rows) > 2 and len(rows[0][1]) == width - 1:
-        rows[0][1].insert(0, "")  # the corner above a column and beside a row of coordinates
+        rows[0][1].insert(0, "")  # the corner between a column and a row of coordinates
     width, width_line = len(rows[0][1]), rows[0][0]
     words: dict[str, int] = {}
     corner = None if _is_number(rows[0][1][0]) else rows[0][1][0]
@@ -157,7 +157,7 @@ def _refuse_ragged(path: Path, line: int, count: int, wanted: str, cells: list[s
 
 
 def refuse_cut_end(path: Path, text: str) -> None:
-    """A copy cut off inside the last number (5.4e-007 -> 5.4) would otherwise read as 5.4 m.
+    """Refuse a copy that was cut off inside the last number: 5.4e-007 cut to 5.4 would read as 5.4 m.
 
     Raises:
         InputError: the last number is not spelt like the one before it.
@@ -176,7 +176,7 @@ def refuse_cut_end(path: Path, text: str) -> None:
 
 
 def _refuse_overflow(path: Path, text: str, separator: str | None, first_line: int) -> None:
-    """An infinity that is not written as one is a number too large to hold, such as 1e400."""
+    """Refuse numbers too large to hold, such as 1e400, which read as an infinity that was not written."""
     for line, row in enumerate(text.split("\n"), start=first_line):
         for cell in row.split(separator):
             if "inf" not in cell.lower() and _is_number(cell) and np.isinf(float(cell)):
@@ -188,5 +188,5 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    # Python alone takes 1_000 for a number.
+    # Only Python takes 1_000 for a number.
     return "_" not in cell

@@ -27,7 +27,7 @@ _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _ORIENTATION, _UPRIGHT = 274, 1
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
-# Makers keep heights beside a picture in tags of their own.
+# Some makers keep heights beside a picture in private tags.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
 _LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
@@ -42,7 +42,7 @@ def read_channels(path: Path) -> list[Channel]:
 
     The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their
     unit; otherwise these usually describe paper, not the sample. Calibrations of the values by ImageJ and
-    GDAL are applied, GDAL's no-data value is a missing pixel. Reduced copies of a page are passed over.
+    GDAL are applied; GDAL's no-data value marks a missing pixel. Reduced copies of a page are skipped.
 
     Raises:
         InputError: damaged file.
@@ -69,10 +69,10 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
 
 
 def require_upright(path: Path, page: Any) -> None:
-    """Refuse a page that its file says to be stored turned or mirrored: programs differ in what they show.
+    """Refuse a page marked as turned or mirrored, because programs differ in how they show it.
 
     Raises:
-        InputError: so it says.
+        InputError: the orientation is not upright.
     """
     stated = page.tags.valueof(_ORIENTATION, _UPRIGHT)
     if stated != _UPRIGHT:
@@ -89,7 +89,7 @@ def maker_of(path: Path) -> str:
             pages = islice(file.pages, _FIRST_PAGES)
             lext = any(_LEXT in str(getattr(page, "description", "")) for page in pages)
             return "lext" if lext else next((kind for code, kind in _SIGNED.items() if code in tags), "")
-    except InputError:  # the reader that tries it next reports it
+    except InputError:  # the reader that tries the file next reports the error
         return ""
 
 
@@ -137,8 +137,7 @@ def _calibration(
     """Scale, offset, unit and no-data value of a page.
 
     Raises:
-        InputError: a calibration of ImageJ that is no straight line, a scale in the description that is not
-            known.
+        InputError: a calibration of ImageJ that is no straight line, or an unknown scale in the description.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -162,7 +161,7 @@ def _calibration(
 
 
 def _plain_text(description: str) -> str:
-    """A description as lines of keys and values, also where it is JSON."""
+    """A description as lines of keys and values, even if it is JSON."""
     try:
         return "\n".join(f"{key}: {value}" for key, value in json.loads(description).items())
     except (ValueError, AttributeError):  # no JSON, or no object
@@ -176,7 +175,7 @@ def _plain_unit(unit: Any) -> str:
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
     """(y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
 
-    Pages belong to the images in turn, as many to each as its sizes in z, channel and time say.
+    Pages belong to the images in turn; each image has as many pages as its sizes in z, channel and time say.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
@@ -221,7 +220,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
 
 
 def single_sample(path: Path, pixels: Array) -> Array:
-    """(ny, nx) from (ny, nx) or from (ny, nx, 1 to 4) whose colours are identical and which hides nothing.
+    """(ny, nx) from (ny, nx), or from opaque (ny, nx, 1 to 4) with identical colours.
 
     Raises:
         InputError: the colours differ, so a pixel has no single value, or pixels are transparent.

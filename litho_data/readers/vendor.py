@@ -29,8 +29,8 @@ from litho_data.scan import Axis
 
 _HEAD_BYTES = 512
 IMPORTS = ("SurfaceTopography.IO", "igor2.binarywave")
-# How files start, of the formats that say who wrote them. What has no signature is not here: any bytes of the
-# right length would pass as a map.
+# How files of formats with a signature start. Formats without a signature are left out, because any bytes of
+# the right length would pass as a map.
 _STARTS: dict[str, tuple[bytes, ...]] = {
     "al3d": (b"AliconaImaging\0\r\n",),
     "bcr": (b"fileformat = bcr", "fileformat = bcr".encode("utf-16-le"), "fileformat = bcr".encode("utf-16")),
@@ -55,7 +55,7 @@ _STARTS: dict[str, tuple[bytes, ...]] = {
 }
 _ZIP, _IN_ZIP = b"PK\x03\x04", ("x3p", "mitutoyo", "nmm", "plux", "poir", "qep")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-# Not read from any file in our tests.
+# Formats of which the tests read no file.
 _UNTESTED = {
     "datx", "frt", "lext", "mdt", "metropro", "mitutoyo", "nmm", "oir", "opdx", "os3d", "plux", "poir", "qep",
     "vk", "zmg", "zon",
@@ -63,7 +63,7 @@ _UNTESTED = {
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
 # Digital Surf's kinds of studiables that are not one surface (series, layers, pictures, curves, spectra), and
-# where the kind stands.
+# the position of the kind in the file.
 _NO_SURFACES, _SURFACE_KIND_AT = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 15, 20, 21), 18
 _IGOR_HEADERS = {1: 8 + 110, 2: 16 + 110, 3: 20 + 110, 5: 64 + 320}
 _IGOR_5_SIZES = "15I"
@@ -108,7 +108,7 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Whether the header has a version of Igor's waves and, but for the usual one, the right sum."""
+    """Whether the header has a version of Igor's waves and (except for the usual one) the right checksum."""
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
     size = _IGOR_HEADERS.get(version, 0)
@@ -142,7 +142,7 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """igor2 trusts the sizes in the header of version 5 and walks through gigabytes of labels."""
+    """Refuse a wave shorter than its header says; igor2 trusts version 5 and would walk through gigabytes."""
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
         return
@@ -186,7 +186,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
-    # A size is required even if the file has none; heights do not depend on it.
+    # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with foreign_parser(path, kind), _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()

@@ -19,7 +19,8 @@ _BAD = "Bad"
 def read_channels(path: Path) -> list[Channel]:
     """One channel per block; the second flag of the first line says whether heights are in nm or in waves.
 
-    The format writes column after column, each from the bottom. A file with a line per row is read by rows.
+    The format stores columns one after another, each from the bottom. A file with one line per row is read by
+    rows.
 
     Raises:
         InputError: a header without sizes or wavelength, or blocks of other sizes.

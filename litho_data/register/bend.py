@@ -1,4 +1,4 @@
-"""A bent scan: the smooth, quadratic difference between where a scanner was and where it says it was."""
+"""A bent scan: the smooth, quadratic difference between the true and the stated position of the scanner."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.foundation.kinds import YX, Array, Shape
 _ITERATIONS = 30
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# Of the half width of the scan: far below a thousandth of a pixel.
+# As a share of the half width of the scan: far below a thousandth of a pixel.
 _SETTLED = 1e-9
 
 
@@ -20,8 +20,8 @@ class Bend:
     """Displacement of the points of a scan, a polynomial of u and v, which run from -1 to 1 over the frame.
 
     ``amount`` is (2, 3): along x and y, for u² - 1/3, uv and v² - 1/3; or (2, 11) for a scanner that creeps,
-    with the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v) behind. These terms are centred: over the
-    frame the best affine part of a bend is zero. ``middle`` and ``half`` are the frame's centre and half its
+    followed by the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v). These terms are centred: the best
+    affine part of a bend over the frame is zero. ``middle`` and ``half`` are the frame's centre and half its
     size (x, y), in the unit of ``amount``; u = (x - middle) / half.
     """
 
@@ -31,13 +31,13 @@ class Bend:
 
     @classmethod
     def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
-        """The bend of a scan of (ny, nx) pixels of a (y, x) pitch, in µm of its own frame."""
+        """The bend of a scan with (ny, nx) pixels and this (y, x) pitch, in µm of its own frame."""
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
         return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
     @property
     def figures(self) -> dict[str, float]:
-        """The bend as it enters the quality record: its largest displacement and its six coefficients, µm.
+        """The bend for the quality record: its largest displacement and its six coefficients, µm.
 
         ``bend_x_by_xx_um`` is the displacement along x per u² - 1/3, and so on.
         """
@@ -57,7 +57,7 @@ class Bend:
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
 
     def scaled(self, factor: float) -> Bend:
-        """The same bend in a unit that is ``1 / factor`` as long."""
+        """The same bend in a unit ``1 / factor`` times as long."""
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
@@ -71,9 +71,9 @@ class Bend:
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """The points of the scan whose true position is (x, y), by Newton's method, all points at once.
+        """The points of the scan with true position (x, y), by Newton's method for all points at once.
 
-        A position that no point has comes back far outside the frame.
+        For a position that no point has, the result lies far outside the frame.
         """
         at_x, at_y = (np.array(one, dtype=float) for one in np.broadcast_arrays(x, y))
         for _ in range(_ITERATIONS):
@@ -85,7 +85,7 @@ class Bend:
                 step_x = ((1 + yy) * miss_x - xy * miss_y) / determinant
                 step_y = ((1 + xx) * miss_y - yx * miss_x) / determinant
             open_ = ~((np.abs(step_x) < _SETTLED * self.half[0]) & (np.abs(step_y) < _SETTLED * self.half[1]))
-            # Half a frame per step: more than any accepted bend, and too short to diverge.
+            # At most half a frame per step: more than any accepted bend, and too short to diverge.
             at_x += np.clip(np.nan_to_num(step_x), -self.half[0], self.half[0])
             at_y += np.clip(np.nan_to_num(step_y), -self.half[1], self.half[1])
             if not open_.any():
@@ -102,7 +102,7 @@ class Bend:
     @property
     def slope(self) -> float:
         """The largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
-        # Linear in u and v the gradient of a quadratic bend is largest in a corner; that of creep at an end.
+        # The gradient of a quadratic bend is linear, so it is largest in a corner; that of creep, at an end.
         gradient = np.array(self._gradient(*self._grid(2 if self.degree == 2 else 33)))
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
@@ -118,7 +118,7 @@ class Bend:
 
     @property
     def degree(self) -> int:
-        """Of the polynomial: 2, or 6 for creep."""
+        """Degree of the polynomial: 2, or 6 for creep."""
         return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
 
     def unit(self, x: Array, y: Array) -> tuple[Array, Array]:

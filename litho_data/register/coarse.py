@@ -30,7 +30,7 @@ class CoarseFit:
     """Where the scan lies, to a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
-    ``points`` is None where too few keypoints match: the best correlation over all shifts is the fit then.
+    ``points`` is None if too few keypoints match; the fit is then the best correlation over all shifts.
     """
 
     orientation: str
@@ -55,10 +55,10 @@ def find_coarse(
     """The best coarse fit, or None if scan or layout shows no structure.
 
     Args:
-        scan: (ny, nx) heights at the layout's pitch without bow, NaN where not measured.
+        scan: (ny, nx) heights at the layout's pitch, bow removed, NaN where not measured.
         layout_level: (ny, nx) integer levels.
         smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
-        features: whether to match keypoints; on a layout that repeats itself they match everywhere.
+        features: whether to match keypoints; on a repeating layout they would match everywhere.
         seed: of the robust estimators.
     """
     hypotheses = search_orientation(scan, smooth_layout)
@@ -83,7 +83,7 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 
 
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
-    """Orientations and polarities to look for keypoints in.
+    """Orientations and polarities in which to look for keypoints.
 
     ORB does not depend on rotation, so only the four combinations of mirror image and polarity differ; all
     are tried if the correlation leaves the orientation open.

@@ -1,8 +1,8 @@
 """Scans that no straight warp fits: a scanner bends them, or it creeps.
 
-A bend displaces what is scanned by a quadratic function of the place. A scanner that is still settling
-displaces its lines along both axes by a smooth function of the slow axis alone. A straight warp takes the
-linear part of that; what remains bends the print by a tenth of the creep, without any other sign.
+A bend displaces the image by a quadratic function of position. A scanner that is still settling displaces its
+lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the linear part of
+the creep; the rest distorts the print by a tenth of the creep and shows nowhere else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from litho_data.register.topography import fill_gaps, predicted_topography, quad
 
 Curve = int | Literal["quadratic"] | None
 """What is fitted beside an affine: the slow axis (0 = x, 1 = y) of a creep, a bend, or nothing."""
-# Every second pixel of the layout in both directions places the print as well as all of them.
+# Every second pixel of the layout in both directions locates the print as well as all pixels.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
@@ -35,8 +35,8 @@ def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow:
     """The straight warp and a creep on top, or None if blocks held out of the fit do not prefer it.
 
     The displacement along x and y is a polynomial of degree 6 in the slow coordinate, ten numbers besides
-    the affine. It is fitted to two halves of the field, squares of 64 px in a chequerboard, and each fit
-    predicts the other half; so is the straight warp.
+    the affine. Both it and the straight warp are fitted to each half of the field, squares of 64 px in a
+    chequerboard, and each fit predicts the other half.
 
     Args:
         scan: (ny, nx) oriented heights at the layout's pitch, NaN where not measured.
@@ -57,11 +57,12 @@ def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow:
 
 
 def refine_bent(scan: Array, layout_level: Array, straight: FineFit) -> FineFit | None:
-    """The straight warp refined again, as an affine and a bend of the scan; None if that does not settle.
+    """The straight warp refined again as an affine and a bend of the scan; None if the fit does not converge.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: what that returned; its error may reach the width of structures at a quarter resolution.
+        straight: the result of ``refine_pyramid``; its error may reach the width of structures at a quarter
+            resolution.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -129,16 +130,16 @@ def _is_confirmed(case: _Images, straight: tuple[Array, Bend], whole: tuple[Arra
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # Ranks, because creep fades along the scan: a few blocks gain most, which says nothing against it.
+    # A rank test, because creep fades along the scan, so that a few blocks gain most.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
 
 class _Images:
-    """A scan and the topography that it is compared with; warps between them fitted to any pixels."""
+    """A scan and the topography that it is compared with, for fitting warps to any choice of pixels."""
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """``every``: pixel of the topography is used; its index counts those that are."""
+        """``every``: use every n-th row and column of the topography; indices count these."""
         from scipy.ndimage import spline_filter
 
         self._measured = np.isfinite(scan)
@@ -151,7 +152,7 @@ class _Images:
         self.everywhere = interior_of(shape, BORDER_PX // every)
 
     def fit(self, matrix: Array, bend: Bend, curve: Curve, chosen: Array) -> tuple[Array, Bend] | None:
-        """Affine and curve by Gauss-Newton steps; None if they do not settle."""
+        """Affine and curve by Gauss-Newton steps; None if they do not converge."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
         points = lattice(y, x)
         for _ in range(_ITERATIONS):
@@ -179,7 +180,7 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Squared misfit of every pixel, gain and background from the fitted ones; NaN outside the scan."""
+        """Squared misfit of every pixel, gain and background fitted to ``fitted``; NaN outside the scan."""
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)
         chosen = inside & fitted
@@ -197,7 +198,7 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """What can move a point of the scan along one axis: 1, u, v, and what the curve has beyond."""
+    """The terms that can move a point of the scan along one axis: 1, u, v, and those of the curve."""
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]
     if curve == "quadratic":

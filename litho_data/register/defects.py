@@ -1,4 +1,4 @@
-"""Where a scan shows something else than the print: dust, collapsed or missing parts, lifted film.
+"""Where a scan shows something other than the print: dust, collapsed or missing parts, lifted film.
 
 Such an area pulls a least-squares warp by pixels. Its heights differ from what the layout predicts by many
 times the usual misfit over a connected area, whatever the response of the printer is.
@@ -15,26 +15,27 @@ from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-# Misfit in units of its robust standard deviation. An area is suspected from the first on, followed down to
-# the second, and is a defect if it reaches the third once the warp is fitted without it. What a printer does
-# that is no Gaussian blur stays below that: 13.5 on the measured prints.
+# Misfit in units of its robust standard deviation. An area that reaches the first is suspected and traced
+# down to the second; it is a defect if it reaches the third after a fit of the warp without it. Effects of a
+# printer other than a Gaussian blur stay below: 13.5 on the measured prints.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# Beyond it there is no main surface left, and the whole print is in question.
+# Beyond this share no main surface is left, and the whole print is in question.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
 _FEWEST_PX = 60
-# Of the standard deviation of the scan.
+# As a share of the standard deviation of the scan.
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
-# Pixels that leave and enter at the edge of a mask keep the steps above a thousandth of a pixel.
+# Pixels that enter and leave at the edge of a mask keep the steps above a thousandth of a pixel.
 _TOLERANCE_PX = 0.01
-# Share of the field from which a suspected area may have spoiled the fit that makes it look small.
+# From this share of the field on, a suspected area may have spoiled the fit so that its own misfit looks
+# small.
 _WORTH_A_FIT = 0.005
-# Correlation below which a whole print may misfit; the measured ones have 0.945 and more.
+# Correlation below which a whole print may misfit; the measured prints have 0.945 and more.
 _SUSPICIOUS = 0.9
 _MAD_PER_SIGMA = 0.6745
 _TUKEY = 4.685
@@ -44,10 +45,10 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """The fit of what shows the print, and the defects, bool (ny, nx) of the layout; or the plain fit.
+    """The fit without the defects, and the defects, bool (ny, nx) of the layout; or the plain fit.
 
-    The coarse warp is robust and starts every round: defects are found under the last warp, and the warp
-    is fitted to the rest, until its corners stay.
+    Every round starts from the coarse warp, which is robust: it finds the defects under the last warp and
+    fits the warp to the rest, until the corners of the warp no longer move.
 
     Args:
         plain: ``refine_pyramid(scan, layout_level, start, model)``.
@@ -76,7 +77,7 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Pixels of the layout that show something else than the print, with a margin, and their largest misfit.
+    """Pixels of the layout that show something other than the print, with a margin, and their largest misfit.
 
     The misfit is the scan on the layout's pixels minus a free function of the predicted topography
     (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
@@ -95,7 +96,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     misfit = _misfit(scan, fine)
     if misfit is None:
         return nowhere
-    # Without noise the misfit may be all edges: what is small beside the print is no defect.
+    # Without noise the whole misfit may come from edges, so a misfit that is small beside the print is no
+    # defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
     if size.max() <= SUSPECT_SIGMA:
@@ -107,7 +109,7 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
         return nowhere
-    # Where a missing part happens to have the right height, it is missing all the same.
+    # A missing part is missing even where the ground happens to have the right height.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 
@@ -123,7 +125,7 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
     """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing.
 
-    None if it shows next to nothing of the layout.
+    None if the scan shows next to nothing of the layout.
     """
     from scipy.ndimage import map_coordinates
 
@@ -148,7 +150,7 @@ def _misfit(scan: Array, fine: FineFit) -> Array | None:
 
 
 def _robust(design: Array, values: Array) -> Array:
-    """Coefficients under Tukey's weights, from a start under weights that fall off slowly."""
+    """Coefficients with Tukey's weights, starting from a fit with weights that fall off slowly."""
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])
     for step in range(_PASSES):

@@ -13,13 +13,13 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# The mean shifts of blocks differ by this much on straight scans, and by up to 4 standard errors.
+# On straight scans the mean shifts of blocks differ by up to this much, and by up to 4 standard errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """What single blocks of the field say about the warp; arrays (n, 2) of (x, y) in layout pixels.
+    """How single blocks of the field fit the warp; arrays (n, 2) of (x, y) in layout pixels.
 
     ``shift_px`` is the distance of a block's content from where the warp puts it, ``held_out_px`` the same
     for a warp fitted without the block.
@@ -38,13 +38,13 @@ class BlockShifts:
         """Peak to valley of the mean shift along ``axis`` (0 = x, 1 = y) as a function of ``along``.
 
         A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
-        not linear, or that it creeps, which no rung of the ladder can follow.
+        not linear or that the scanner creeps, which no rung of the ladder can follow.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Whether a curve along this axis is large, and beyond the scatter of the blocks of one place."""
+        """Whether the curve along this axis is large and exceeds the scatter of blocks at the same place."""
         for axis in (0, 1):
             groups = self._by_place(axis, along)
             if len(groups) < 3 or min(len(group) for group in groups) < 3:
@@ -73,13 +73,13 @@ def match_blocks_of_field(
     """The shift of every block, under the warp and under a warp refitted to the pixels outside the block.
 
     Args:
-        registered: (ny, nx) smoothed scan on the layout's pixels without background, gaps filled.
+        registered: (ny, nx) smoothed scan on the layout's pixels, background removed, gaps filled.
         measured: (ny, nx) where it was measured.
         topography: (ny, nx) blur-matched topography.
 
-    Blocks are half-overlapping windows of four cells, away from the layout's border, with structure and
-    at most a tenth of gaps. A block's shift is the peak of its normalised cross-correlation (parabola
-    through the neighbours).
+    Blocks are half-overlapping windows of four cells, away from the layout's border, with structure and with
+    gaps in at most a tenth of their area. A block's shift is the peak of its normalised cross-correlation
+    (parabola through the neighbours).
     """
     import cv2
 
@@ -127,7 +127,7 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 
 
 def height_correlation(height: Array, layout_level: Array) -> float:
-    """Pearson correlation of heights, smoothed with sigma = 1 px, with the layout as it is.
+    """Pearson correlation of heights, smoothed with sigma = 1 px, with the unblurred layout.
 
     Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
     """

@@ -35,11 +35,11 @@ class Correspondence:
     hull_px2: float
 
     def coverage(self, overlap: Array) -> float:
-        """Area spanned by the inliers as a share of the pixels where scan and layout overlap."""
+        """Area spanned by the inliers, as a share of the overlap of scan and layout."""
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
     def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
-        """Root mean square distance of the inliers from a warp, scan pixels; of a bent scan, straightened."""
+        """Root mean square distance of the inliers from a warp, in pixels of the (straightened) scan."""
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
         found = self.scan_points[self.inlier]
         found = found if bend is None else bend.straighten(found)
@@ -91,7 +91,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
 
 
 def match_bits(first: Array, second: Array) -> tuple[Array, Array]:
-    """Cross-checked matches of binary descriptors: those of OpenCV's matcher, in a third of its time.
+    """Cross-checked matches of binary descriptors, as by OpenCV's matcher but in a third of the time.
 
     Args:
         first: (n, b) uint8 with n < 65536 and b a multiple of 8; second: (m, b) alike.
@@ -102,9 +102,10 @@ def match_bits(first: Array, second: Array) -> tuple[Array, Array]:
     """
     words, other_words = first.view(np.uint64), np.ascontiguousarray(second.view(np.uint64).T)
     nearest = np.empty(len(first), dtype=np.intp)
-    # Distance in the high half, row in the low half: the smallest key is the first of the nearest rows.
+    # Distance in the high half, row in the low half, so that the smallest key is the first of the nearest
+    # rows.
     least_key = np.full(len(second), np.iinfo(np.uint32).max, dtype=np.uint32)
-    # A few rows at a time stay in the processor's cache.
+    # In portions of a few rows, which stay in the processor's cache.
     for start in range(0, len(first), _ROWS_AT_ONCE):
         rows = words[start : start + _ROWS_AT_ONCE]
         distance = np.zeros((len(rows), len(second)), dtype=np.uint16)

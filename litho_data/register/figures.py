@@ -38,9 +38,9 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
-    """Place, scale and rotation at the layout's middle; of a bent scan, those of the closest affine.
+    """Place, scale and rotation at the layout's middle; for a bent scan, those of the closest affine.
 
-    The place: where the middle lies in the scan less where it lies in the layout.
+    The place is the position of the middle in the scan minus its position in the layout.
     """
     middle_um = (centre(layout_shape) + 0.5) * pitch_um
     linear = np.linalg.inv(linear_part(layout_to_scan, middle_um))

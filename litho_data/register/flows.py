@@ -8,7 +8,7 @@ import numpy as np
 from litho_data.foundation.kinds import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# Number of generators of each rung, counted from the first: the ladder is nested by construction.
+# Each rung uses the first so many generators, so the ladder is nested by construction.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0

@@ -25,7 +25,7 @@ ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
 
 
 def index_to_um(pitch_um: YX) -> Array:
-    """The matrix that takes pixel indices (x, y) to µm for a (y, x) pitch."""
+    """The matrix from pixel indices (x, y) to µm for a (y, x) pitch."""
     pitch_y, pitch_x = pitch_um
     return np.array([[pitch_x, 0.0, pitch_x / 2], [0.0, pitch_y, pitch_y / 2], [0.0, 0.0, 1.0]])
 
@@ -80,7 +80,7 @@ def apply_transform(matrix: Array, points: Array) -> Array:
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
     """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
 
-    With a bend of the target image: the points whose true position is where the matrix points.
+    With a bend of the target image, the result is the points whose true positions the matrix gives.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]

@@ -54,7 +54,7 @@ def search_orientation(
     for orientation, moving, (correlation, overlap) in zip(orientations, turned, correlations, strict=True):
         if np.isnan(correlation).all():
             continue
-        # Only breaks ties: on a repeating layout, the shift with the larger overlap is the better guess.
+        # Breaks ties only: on a repeating layout, the shift with the larger overlap is the better guess.
         handicap = TIE * (1 - overlap / overlap.max())
         # The centre of a block of `factor` pixels is (factor - 1) / 2 after its first pixel; rotating a scan
         # whose size is no multiple of the factor moves the remainder to the other side.
@@ -74,10 +74,10 @@ def search_orientation(
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Correlation of the best rival shift, as a share of that of the registration itself.
+    """Correlation of the best rival shift, as a share of the registration's own correlation.
 
-    A rival is a local maximum of the correlation over shifts, a sixteenth of the field or more away. With
-    the topography in place of the scan, it says how well the layout repeats itself.
+    A rival is a local maximum of the correlation over shifts at least a sixteenth of the field away. With the
+    topography in place of the scan, the result says how well the layout repeats itself.
     """
     from scipy.ndimage import maximum_filter
 
@@ -110,7 +110,7 @@ def rival_orientation(registered: Array, topography: Array) -> float:
 
 
 def reduce_image(image: Array, factor: int) -> Array:
-    """Means over blocks of ``factor`` × ``factor`` pixels; no remainder, NaN where half is missing."""
+    """Means over blocks of ``factor`` × ``factor`` pixels, remainder cut off; NaN where half is missing."""
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
     measured = np.isfinite(blocks)
@@ -124,8 +124,7 @@ def masked_correlations(fixed: Array, movings: Sequence[Array]) -> Iterator[tupl
 
     Yields:
         Correlation and number of overlapping pixels, indexed by the shift modulo their shape; the
-        correlation is NaN where less than ``MIN_OVERLAP`` of the smaller image takes part or one side
-        is constant.
+        correlation is NaN if less than ``MIN_OVERLAP`` of the smaller image overlaps or one side is constant.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
@@ -134,7 +133,7 @@ def masked_correlations(fixed: Array, movings: Sequence[Array]) -> Iterator[tupl
         return rfft2(np.isfinite(fixed).astype(float), shape), *_height_spectra(fixed, shape)
 
     def under(measured: Array, shape: Shape) -> tuple[Array, ...]:
-        """Pixels of the fixed image under the moving one's: number, sum, energy about the mean."""
+        """Pixels of the fixed image under those of the moving one: number, sum, energy about the mean."""
         mask = rfft2(measured.astype(float), shape)
         number, total, energy = (irfft2(np.conj(part) * mask, shape) for part in of_fixed(shape))
         number = np.maximum(np.rint(number), 1.0)

@@ -25,7 +25,7 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """The refinement with the two images that were compared: smoothed scan and blur-matched topography."""
+    """The refinement and the two images that it compared: smoothed scan and blur-matched topography."""
 
     refinement: Refinement
     scan: Array
@@ -48,9 +48,9 @@ def refine_pyramid(
         layout_level: (ny, nx) integer levels.
         start: 3×3 index matrix, layout to scan.
         model: rung of the ladder; the reduced levels use at most an affine.
-        tolerance_px: of the last level.
+        tolerance_px: tolerance of the last level.
 
-    If the last level does not converge the coarse warp stays, marked as not converged.
+    If the last level does not converge, the coarse warp is returned, marked as not converged.
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, layout_level.shape)
@@ -76,7 +76,7 @@ def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model:
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Factor, scan and predicted topography at a quarter and at half resolution, where enough is left."""
+    """Factor, scan and predicted topography at a quarter and at half resolution, if large enough."""
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
@@ -92,7 +92,7 @@ def match_blur(
     from scipy.ndimage import map_coordinates
 
     grid = warped_grid(layout_to_scan, layout_level.shape, bend)
-    # Every other pixel is enough to rank blurs of half a pixel and more.
+    # Every second pixel is enough to rank blurs of half a pixel and more.
     rows, columns = grid[0][::2, ::2], grid[1][::2, ::2]
     warped = map_coordinates(fill_gaps(smooth_scan), (rows, columns), order=1, cval=np.nan)
     valid = np.isfinite(warped)
@@ -108,7 +108,7 @@ def match_blur(
 
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
-    """The warp of a lower rung that moves the corners of the field most like a given warp."""
+    """The warp of a lower rung that moves the corners of the field most nearly as a given warp does."""
     if LADDER[model] >= LADDER["affine"]:
         if model == "homography":
             return matrix
@@ -136,7 +136,7 @@ def _about(linear: Array, point: Array, image: Array) -> Array:
 
 
 def _smooth(scan: Array, sigma_px: float) -> Array:
-    """Smoothed where measured: what fills a gap comes from its surroundings and is no evidence."""
+    """The scan smoothed where measured; gaps stay NaN, because smoothing fills them without evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)
 
 
@@ -144,7 +144,7 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """The fit on the lowest rung that no higher rung beats on blocks it was not fitted to.
+    """The fit on the lowest rung that no higher rung beats on held-out blocks.
 
     Args:
         fine: a converged affine fit; every rung starts from its projection.

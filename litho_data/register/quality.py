@@ -1,4 +1,4 @@
-"""What is recorded about one registration, and when it counts as passed."""
+"""The record of one registration, and when it counts as passed."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -61,7 +61,7 @@ class RegistrationQuality:
 # Limits of a pass; docs/registration.md gives the reason for each.
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
-# Beyond this blur of the print (sigma), the last two grow with it.
+# Beyond this blur of the print (sigma), the last two limits grow with the blur.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
@@ -75,7 +75,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     Args:
         figures: of the fit, the warp and the evidence.
         blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
-        bend_um: of the scan, in its own frame, if one was fitted.
+        bend_um: the bend of the scan in its own frame, if one was fitted.
     """
     smallest, largest = figures["singular_min"], figures["singular_max"]
     scale = f"scale {smallest:.3f} to {largest:.3f}"
@@ -91,7 +91,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     bent_um = 0.0 if bend_um is None else bend_um.largest
     how = "registered with a quadratic distortion"
     if bend_um is not None and bend_um.kind == "creep":
-        how = "its lines creep along the slow axis, and are put back"
+        how = "its lines creep along the slow axis, which is corrected"
     # Written as "not >=", so that a figure that could not be computed fails.
     failures = {
         f"correlation {ecc:.2f}, at least {MIN_ECC} wanted": not fits,
@@ -110,7 +110,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     }
     warnings = {
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
-        f"{defects:.1%} of the field shows something else than the print and is left out": defects > 0,
+        f"{defects:.1%} of the field shows something other than the print and is left out": defects > 0,
         f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
         "layout looks alike in another orientation; upright assumed": tied and upright,
         f"target registration error {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,

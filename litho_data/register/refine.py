@@ -1,4 +1,4 @@
-"""Sub-pixel refinement on the heights themselves: enhanced correlation, any rung of the ladder.
+"""Sub-pixel refinement on the heights themselves by enhanced correlation, on any rung of the ladder.
 
 The correlation between the scan and the predicted topography is maximised over a warp, a gain and a
 quadratic background at once, by Gauss-Newton steps in the inverse compositional form.
@@ -21,16 +21,16 @@ from litho_data.register.topography import fill_gaps, quadratic_basis
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
 _BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
 CELL_PX = 32
-# What surrounds the print is unknown (bare, or its neighbour) and blurs across the layout's border.
+# The unknown surroundings of the print (bare ground or a neighbour) blur across the layout's border.
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """A converged warp, with what is needed to determine how well it is known.
+    """A converged warp, and the data that tell how well it is known.
 
-    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it leads to the straightened scan.
+    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it maps to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, gaps filled. ``gram`` (cells_y, cells_x,
     k, k) holds, per cell of ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp)
     and, last, the scan: any part of the field can be refitted from it without the pixels.
@@ -80,7 +80,7 @@ def refine(
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
         start: 3×3 index matrix, layout to scan, of the kind ``model``.
-        bend: of the scan; the start is an affine then, and with the bend it is only evaluated.
+        bend: bend of the scan. The start is then an affine, and warp and bend are evaluated, not refined.
         max_iterations: largest number of Gauss-Newton steps; 0 only evaluates the start.
         tolerance_px: the iteration ends at a step that moves every corner by less.
     """
@@ -122,10 +122,10 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """``gram`` of a scan that lies on the topography (ny, nx) already, NaN where not measured.
+    """``gram`` of a scan that is already aligned with the topography (ny, nx), NaN where not measured.
 
     ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further`` regressors (ny, nx)
-    stand behind these.
+    follow these.
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)
@@ -136,7 +136,7 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
 def in_blocks(gram: Array) -> Array:
     """Inner products per cell summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
 
-    Errors of the topography extend over a feature or two; a block is the smallest independent piece.
+    Errors of the topography extend over one or two features, so a block is the smallest independent piece.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
@@ -146,7 +146,7 @@ def solve_gram(gram: Array) -> Array:
     """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge at float32 precision of the regressors: what the layout does not determine stays at zero.
+    # A ridge at the regressors' float32 precision keeps at zero what the layout does not determine.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
@@ -192,7 +192,7 @@ def _regressors(topography: Array, count: int) -> Array:
 
 
 class _Sums:
-    """Inner products over the whole field; those of the regressors are reused for an equal overlap."""
+    """Inner products over the whole field; those of the regressors are kept while the overlap stays."""
 
     def __init__(self, regressors: Array):
         self._regressors = regressors

@@ -11,7 +11,7 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# Sub-pixel positions, and the pixels around one that a spline reaches, for figures of the resampling.
+# Number of sub-pixel positions, and reach of the spline in pixels, for the figures of the resampling.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -33,7 +33,7 @@ def resample_to_layout(
         layout_shape: (ny, nx) of the result.
         scan_pitch_um: (y, x) pitch of the scan.
         layout_pitch_um: pitch of the layout.
-        bend_um: of a bent scan, in µm of its frame; it changes where the heights are interpolated.
+        bend_um: bend of the scan, in µm of its frame; it changes where the heights are interpolated.
 
     Returns:
         ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
@@ -95,16 +95,16 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """The same along one axis: what is left of offsets of lines that follow each other along it."""
+    """The same along one axis, for the offsets of lines that follow one another along it."""
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Frequencies (n,), cycles/µm, up to Nyquist's, and the squared error that resampling makes of a wave.
+    """Frequencies (n,) up to Nyquist's, cycles/µm, and the squared error of a resampled wave.
 
-    Relative to the square of its amplitude, averaged over sub-pixel positions; the average over the layout's
-    pixel of a finely sampled scan is no error.
+    The error is relative to the wave's squared amplitude and averaged over sub-pixel positions. Averaging a
+    finely sampled scan over the layout's pixel does not count as an error.
     """
     frequency = np.linspace(0, 0.5, 129)
     lags = _LAGS[None, :] + _PHASES[:, None]
@@ -116,7 +116,7 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """What scan pixels at a distance of lag + phase pixels weigh in one of the layout, (phases, lags)."""
+    """Weights in one layout pixel of scan pixels at a distance of lag + phase pixels, (phases, lags)."""
     from scipy.ndimage import map_coordinates
 
     impulse = np.zeros((513, 1))

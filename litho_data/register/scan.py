@@ -31,9 +31,9 @@ from litho_data.register.topography import predicted_topography, remove_bow
 from litho_data.scan import Axis, Scan
 
 MIN_SIZE_PX = 32
-# A picometre: below any instrument, above rounding.
+# A picometre: below the resolution of any instrument, above rounding.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend contains an affine: a model that is stiffer by choice does not bend.
+# A bend contains an affine, so a model that is stiffer by choice does not bend.
 BENDABLE = ("affine", "homography", "ladder")
 # A real bend accounts for nearly all of the displacement; one half separates the two cases clearly.
 BENT_SHARE = 0.5
@@ -47,11 +47,12 @@ class Registration:
     have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, it is the best guess, or the
     centred placement if there was none.
 
-    ``bend_um`` is set if the scanner has bent the scan: the true position of a point (x_um, y_um) is then
-    ``bend_um.straighten``, and ``scan_to_layout``, the affine closest to the whole map, acts on that.
+    ``bend_um`` is set if the scanner has bent the scan: ``bend_um.straighten`` then gives the true position
+    of a point (x_um, y_um), and ``scan_to_layout``, the affine closest to the whole map, acts on that
+    position.
 
-    ``defects`` (ny, nx) bool, on the layout's pixels, is where the scan shows something else than the print
-    (dust, collapsed or lifted parts); None if that is nowhere.
+    ``defects`` (ny, nx) bool, on the layout's pixels, marks where the scan shows something other than the
+    print (dust, collapsed or lifted parts); None if nothing is marked.
     """
 
     scan_to_layout: Array
@@ -78,7 +79,7 @@ def register_scan(
         layout_pitch_um: pitch of the layout.
         scan_pitch_um: (y, x) pitch of plain heights.
         model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
-        fast_axis: of plain heights, along which the tip moved fast; ``x`` if unknown.
+        fast_axis: of plain heights, the axis along which the tip moved fast; ``x`` if unknown.
         seed: of the robust estimator and the bootstrap.
 
     Raises:
@@ -134,7 +135,7 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Whether a bend accounts for what the straight warp missed: within all limits, on blocks held out."""
+    """Whether a bend explains what the straight warp missed: within all limits, and on held-out blocks."""
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
@@ -182,7 +183,7 @@ class _Case:
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
     def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[Array, Bend | None]:
-        """The layout's µm to the (straightened) scan's, and the bend in the scan's own frame."""
+        """Matrix from the layout to the (straightened) scan, µm, and the bend in the scan's own frame."""
         frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
         ny, nx = self.height_um.shape
         size_um = np.array([nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]])
@@ -191,7 +192,7 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # Turned by 90° a bend is again one: points and their images determine it.
+        # A bend turned by 90° is again a bend, and points and their images determine it.
         points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)

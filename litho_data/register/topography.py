@@ -40,15 +40,15 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         return gaussian_filter(height.astype(float), sigma_px)
     weight = gaussian_filter(measured.astype(float), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
-    # 1e-9 separates pixels that see a few distant measured ones from those that see only rounding.
+    # 1e-9 separates pixels with a few distant measured pixels in reach from pixels with rounding only.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: Array) -> Array:
     """The heights with every NaN replaced: extrapolated for three pixels, then constant.
 
-    A gap's first pixels are the point reflection of the measured side about the nearest measured pixel, so
-    that slopes continue and an interpolating spline does not ring at the border.
+    The first pixels of a gap are the point reflection of the measured side about the nearest measured pixel.
+    So slopes continue, and an interpolating spline does not ring at the border.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -1,7 +1,7 @@
-"""How far a registered scan may lie off its layout, pixel by pixel, and its surface beside the print.
+"""Error of a registered scan's position, pixel by pixel, and the surface in its heights beside the print.
 
 Gain, quadratic surface and warp are fitted again without each block of the field in turn (jackknife). The
-spread of the fits contains what the topography does not explain, as far as blocks differ in it.
+spread of the fits includes what the topography does not explain, as far as blocks differ in it.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from litho_data.register.topography import predicted_topography, quadratic_basis
 # A surface is real if its terms exceed their standard errors by this factor, in root mean square. On virtual
 # prints without tilt and bow it is 1.9 at most.
 _CLEAR = 6.0**0.5
-# How far a place feels what is printed around it (proximity, shrinkage), layout pixels. A fit without that
-# takes it for a surface, and the same in neighbouring blocks, so that the jackknife does not see it.
+# Reach of the effect of surrounding print (proximity, shrinkage), layout pixels. A fit without this effect
+# takes it for a surface, alike in neighbouring blocks, so that the jackknife does not see the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
-# Within as much of the layout's border as a cell is wide, a print has other surroundings than inside. What
-# that does is alike on all four sides, and in all blocks there: it pulls the magnification by more than the
-# jackknife states. A field of this many cells still has two thirds of its area without its outermost ones.
+# Within a cell's width of the layout's border, a print has other surroundings than inside. Their effect is
+# alike on all four sides and in all blocks there, and changes the magnification by more than the jackknife
+# states. A field of this many cells keeps two thirds of its area without the outermost cells.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
@@ -34,10 +34,10 @@ class WarpError:
 
     Attributes:
         covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
-        surface_rms: of the quadratic surface that the fit finds beside the print, its offset aside, over the
-            field, unit of the heights.
-        surface_error_rms: of the error of that fit.
-        is_clear: whether there is such a surface.
+        surface_rms: root mean square over the field of the quadratic surface that the fit finds beside the
+            print, without its offset, in the unit of the heights.
+        surface_error_rms: root mean square of the error of that surface.
+        is_clear: whether the surface is significant.
     """
 
     covariance: Array
@@ -48,16 +48,16 @@ class WarpError:
     def surface_variance(self, levelled: bool) -> float:
         """Mean square of the surface that the heights have beside the print.
 
-        That of a fitted surface is larger than that of the true one by the variance of the fit. What
-        levelling took is not a surface of the scan, but of the print with its roughness, which is in the
-        error of the fit and no longer in the heights: here the two squares add.
+        The mean square of a fitted surface exceeds that of the true one by the variance of the fit. Levelling
+        has removed a surface not of the scan but of the print with its roughness. That part is in the error
+        of the fit and no longer in the heights, so after levelling the two squares add.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
         return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
     def warp_variance(self, height: Array) -> Array:
-        """Variance of registered heights (ny, nx) by the error of the warp: steep places move most."""
+        """Variance of registered heights (ny, nx) from the error of the warp; it is largest on slopes."""
         shape = height.shape
         normalise = normalisation(shape)
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
@@ -90,7 +90,7 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
     around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
     cells = aligned_gram(smooth, topography, count, around)
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
-    # The registration knows nothing of the surroundings, so its error is that of a fit without them.
+    # The registration ignores the surroundings, so its error is that of a fit without them.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
     _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:

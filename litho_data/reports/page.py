@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
     Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
 
-# Column of a table to its name for people and what it is; the CSV keeps the key.
+# Column of a table to its title and meaning; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
 _SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns that hold keys, which are spelt out like the names of columns.
+# Columns whose values are keys, which are spelt out like the names of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -41,9 +41,9 @@ class Page:
         title: what was done, on what.
         lead: one line below it.
         run: the run that made the result; by default the one that writes the page.
-        facts: what else identifies it, such as hashes and seeds, by name.
-        words: what columns of its tables are called, and what they mean, or the TOML file that says so;
-            others are spelt out from their key.
+        facts: further facts that identify the result, such as hashes and seeds, by name.
+        words: titles and meanings of the columns of its tables, or the TOML file with them; other columns are
+            spelt out from their key.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Page:
         self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
-        """Start a section; a folded one shows its heading only until it is opened."""
+        """Start a section; a folded one shows only its heading until it is opened."""
         self._sections.append({"title": text, "folded": folded, "parts": []})
 
     def verdict(self, text: str) -> None:
@@ -77,7 +77,7 @@ class Page:
         self._add("paragraph", text=text)
 
     def note(self, *texts: str) -> None:
-        """What the reader must not overlook, in one box; without texts, none."""
+        """One box with what the reader must not overlook; nothing without texts."""
         if texts:
             self._add("note", texts=texts)
 
@@ -105,12 +105,12 @@ class Page:
         digits: int = 2,
         columns: Sequence[str] | None = None,
     ) -> None:
-        """A table that sorts; ``write`` also saves it at full precision as ``csv_name`` beside the page.
+        """A sortable table; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
-            table: a frame, columns by name, or its rows: mappings or records. A record in a row has a column
-                for each of its fields, ``row_field``; an interval and a list are spelt out.
-            digits: places after the point; a smaller number keeps two figures.
+            table: a frame, columns by name, or rows: mappings or records. A record inside a row gets a column
+                for each of its fields, ``row_field``; intervals and lists are spelt out.
+            digits: decimal places; numbers too small for them keep two significant figures.
             columns: those to show, in this order; all by default.
         """
         frame = _frame(table, digits)
@@ -141,12 +141,12 @@ class Page:
         Args:
             columns: title and colour bar of each.
             rows: label and one picture per column, as of :func:`coloured_png`.
-            caption: below.
+            caption: text below the pictures.
         """
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page, its tables and what a paper takes into ``folder``; returns the path of the page."""
+        """Write the page, its tables and the copies for a paper into ``folder``; returns the page's path."""
         target = Path(folder)
         for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
@@ -190,7 +190,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
 
 
 def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Columns and values of a row, those of the records in it beside its own."""
+    """Columns and values of a row, including those of the records in it."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):
             yield from _cells(value, digits, f"{prefix}{key}_")
@@ -211,7 +211,7 @@ def _template() -> jinja2.Template:
 
 
 def filled(template: Path, **values: object) -> str:
-    """A page of text from its template (Jinja) and the values that the template names."""
+    """A text from its template (Jinja) and the values that the template names."""
     return _plain(template).render(values)
 
 
@@ -230,7 +230,7 @@ def _plain(template: Path) -> jinja2.Template:
 
 
 def _whole_options(text: str) -> Markup:
-    """Options of commands in a sentence do not break over two lines."""
+    """Keep options of commands in a sentence from breaking over two lines."""
     from markupsafe import Markup, escape
 
     return Markup(
@@ -239,7 +239,7 @@ def _whole_options(text: str) -> Markup:
 
 
 def capitalised(text: str) -> str:
-    """A text with a capital to begin with, the rest as it is."""
+    """The text with a capital first letter and the rest unchanged."""
     return text[:1].upper() + text[1:]
 
 

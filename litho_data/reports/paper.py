@@ -1,4 +1,4 @@
-"""Figures and tables of a report once more, as a paper takes them."""
+"""Copies of the figures and tables of a report, in the form that a paper needs."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 Figures = Literal["pdf", "svg", "png"]
 Tables = Literal["csv", "latex", "markdown"]
 
-# One column and two of a page of two columns.
+# Width of one and of two columns of a two-column page.
 _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
-# What is wider than this on the screen is not legible in one column.
+# A figure wider than this on the screen is not legible in one column.
 _WIDE_INCH = 8.0
 _FONT_PT, _DPI = 7.0, 300
 
 
 @dataclass(frozen=True)
 class PaperCopies:
-    """What is written beside a report: figures in one format, tables in one beside CSV."""
+    """What is written beside a report: figures in one format, tables in one format besides CSV."""
 
     figures: Figures | None = None
     tables: Tables = "csv"
@@ -49,7 +49,7 @@ def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iter
 
 
 def wanted() -> PaperCopies:
-    """What is asked for where this is called."""
+    """The copies that the surrounding ``paper_copies`` asks for."""
     return _WANTED.get() or PaperCopies()
 
 
@@ -62,12 +62,12 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
             command(**values)
 
     figures = Annotated[Figures | None, option("also write the figures, in the widths of a paper's columns")]
-    tables = Annotated[Tables, option("what the tables are written as, beside CSV")]
+    tables = Annotated[Tables, option("format of the tables, besides CSV")]
     return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
-    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; they are changed."""
+    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; changes the figures."""
     if not figures:
         return
     import matplotlib
@@ -86,7 +86,7 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
 
 
 def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
-    """Write a table as asked for, beside its CSV file: full precision there, ``digits`` places here.
+    """Write a table in the wanted format with ``digits`` places, beside its CSV file with full precision.
 
     Args:
         frame: the table; ``names``: what a reader calls its columns.

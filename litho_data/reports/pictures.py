@@ -32,7 +32,7 @@ DARK = {
     "band": "#1d232b",
     "accent": "#6cb8ea",
 }
-# One colour a model, on every page; each stands out from both papers (3:1, tests/test_report.py).
+# One colour per model on every page; its contrast is 3:1 on light and dark paper (tests/test_report.py).
 _MODEL_COLOURS = {
     "identity": "#868d98",
     "none": "#868d98",
@@ -56,7 +56,7 @@ _GAP = 255  # the last entry of the palette, transparent
 
 
 def model_colour(name: str) -> str:
-    """The colour of a model on every page: fixed for those of the project, else drawn from its name."""
+    """The colour of a model on every page: fixed for the project's models, else derived from the name."""
     known = _MODEL_COLOURS.get(name)
     return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
 
@@ -113,13 +113,13 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
 
 
 def limits(image: Array) -> tuple[float, float]:
-    """Lowest and highest value of a picture, a few outliers aside."""
+    """Lowest and highest value of a picture, except for a few outliers."""
     low, high = np.nanpercentile(image, (0.5, 99.5))
     return float(low), float(high)
 
 
 def thumbnail(image: Array, side_px: int = 180) -> Array:
-    """Every so many pixels of an image (ny, nx), at most this many along a side."""
+    """Every n-th pixel of an image (ny, nx), so that no side has more than ``side_px``."""
     step = max(1, -(-max(image.shape) // side_px))
     return image[::step, ::step]
 
@@ -130,11 +130,11 @@ def colour_bar_png(colours: str) -> str:
 
 
 def shown_html(line: str, **images: Array) -> str:
-    """What a notebook shows of an object with maps: the line of its ``repr``, and each map with its range.
+    """What a notebook shows of an object with maps: the line of its ``repr``, then each map with its range.
 
     Args:
         line: the line.
-        images: maps (ny, nx) by what they show.
+        images: maps (ny, nx) by name.
     """
     figures = []
     for name, values in images.items():

@@ -46,7 +46,7 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
         raise InputError("surface", got="no valid pixel", wanted="at least one")
     deviation = height_nm - height_nm.mean()
     sq_nm = float(np.sqrt(np.mean(deviation**2)))
-    # Rounding of the mean leaves 1e-16 of the height; below that a surface is flat.
+    # Rounding of the mean leaves 1e-16 of the height; a surface with less is flat.
     flat = sq_nm <= 1e-12 * max(1.0, float(np.abs(height_nm).max()))
     return AmplitudeParameters(
         sa_nm=float(np.abs(deviation).mean()),

@@ -10,7 +10,7 @@ from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
-# The period of a scanner that is not calibrated is within this factor of the true one.
+# The period that an uncalibrated scanner shows is within this factor of the true one.
 SEARCHED = 1.25
 # A window of two periods is blind to the mean and to all harmonics; phases need a few of them side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
@@ -30,7 +30,7 @@ class Wave:
 
 
 class Scale(Record):
-    """What a stated length has to be multiplied by to be true, and the standard uncertainty of that."""
+    """The factor from stated to true lengths, and its standard uncertainty."""
 
     factor: float
     uncertainty: float
@@ -40,14 +40,14 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
     """The fundamental of a grating whose period lies along an axis, to a few degrees.
 
     The phase is measured in windows of two periods (Hann along the axis, all of the other axis). Its slope
-    along the axis corrects the frequency, the scatter of the phases about it gives the uncertainty: noise,
-    drift and a bent scanner axis alike.
+    along the axis corrects the frequency; the scatter of the phases about the line gives the uncertainty from
+    noise, drift and a bent scanner axis together.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
         pitch_um: stated (y, x) pitch.
-        period_um: known period; the one that is searched for lies within a factor of ``SEARCHED``.
-        axis: of the period that is wanted.
+        period_um: known period; the search covers a factor of ``SEARCHED`` around it.
+        axis: the axis of the period.
 
     Raises:
         InputError: fewer than eight periods, or nothing that is periodic.
@@ -77,7 +77,7 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
 
 def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
-    """By how much the middle of a line lies too far along x, against its ends, µm; and its uncertainty.
+    """How far the middle of a line is displaced along x relative to its ends, µm; and its uncertainty.
 
     A pixel at x of a line of length L shows what lies at x + 4 b (x / L) (1 - x / L), up to shift and scale.
 
@@ -102,8 +102,8 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
 def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
     """Scales of the axes whose gratings were measured, for a scanner without shear.
 
-    With stated lengths that are c times too short, a frequency is c times too high: (x / c_x)² + (y / c_y)²
-    is the square of the true one, whatever the angle at which a grating lies.
+    If stated lengths are c times too short, a frequency is c times too high. So (x / c_x)² + (y / c_y)² is
+    the square of the true frequency, at whatever angle a grating lies.
 
     Args:
         waves: measured wave, known period and its standard uncertainty (µm) of each grating.
@@ -137,12 +137,12 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """By how much the frequency (along, across) is off, the uncertainty of the first, scatter in rad."""
+    """Error of the frequency (along, across), the uncertainty of the first, and the scatter in rad."""
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
     places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
     slope, error, scatter = _line(places, phases)
-    # Across, four bands are enough for a small angle; in each the waves along the axis are averaged out.
+    # Across the axis, four bands are enough for a small angle; in each, the other waves average out.
     window = np.hanning(len(x))
     bands = [band @ window for band in np.array_split(carried, 4)]
     centres = np.array([band.mean() for band in np.array_split(y, 4)])
@@ -171,5 +171,5 @@ def _line(places: Array, phases: Array) -> tuple[float, float, float]:
 
 
 def _wider(freedom: int) -> float:
-    """The scatter of a few phases is uncertain itself: Student's t with this freedom is that much wider."""
+    """Factor for the uncertain scatter of a few phases: how much wider Student's t is with this freedom."""
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

@@ -35,7 +35,7 @@ def retained_variance(
 ) -> float:
     """Expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
 
-    Sq of a levelled surface is too low by the square root; divide by it to correct.
+    Sq of a levelled surface is too low by the square root of this share; divide by the root to correct.
 
     Args:
         shape: (ny, nx), pixels.
@@ -62,7 +62,7 @@ def retained_variance(
 def retained_variance_by_rows(
     width_px: int, pitch_um: float, correlation: Correlation, *, degree: int
 ) -> float:
-    """The same for levelling each row on its own by a polynomial of ``degree`` (0 = row mean)."""
+    """The same for levelling each row separately by a polynomial of ``degree`` (0 = row mean)."""
     lags_um = (np.arange(width_px)[:, None] - np.arange(width_px)[None, :]) * pitch_um
     matrix = correlation(np.zeros(()), lags_um)
     terms = _orthonormal_polynomials(width_px, degree)

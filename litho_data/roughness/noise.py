@@ -1,4 +1,4 @@
-"""Noise of pixels and of scan lines, told from the print."""
+"""Noise of pixels and of scan lines, separated from the print."""
 
 from math import comb
 
@@ -10,15 +10,15 @@ from litho_data.scan import Axis
 
 # Median absolute deviation of a Gaussian: 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
-# Passes half of the amplitude at 0.84 of the highest frequency, a fiftieth at 0.56: 0.28 cycles per pixel.
+# Passes half of the amplitude at 0.84 of the Nyquist frequency, a fiftieth at 0.56 (0.28 cycles per pixel).
 _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
-    """Pixel noise and line noise of a scan of any print, nm: what is white at the finest scales.
+    """Pixel noise and line noise of a scan of any print, nm: whatever is white at the finest scales.
 
-    A printer writes nothing finer than its spot, so differences of high order leave noise alone: those along
-    both axes the pixels', those of the means of lines along the slow axis the lines'. Line noise that is
+    A printer writes nothing finer than its spot, so differences of high order leave only noise: along both
+    axes that of the pixels, of the line means along the slow axis that of the lines. Line noise that is
     correlated over lines (drift) and noise that the feedback smooths look like the print and are not counted.
 
     Args:
@@ -26,7 +26,7 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
         fast_axis: axis along which the tip moved.
 
     Returns:
-        sd of the pixels' and of the lines' noise; NaN for one that too few pixels determine.
+        sd of the pixel noise and of the line noise; NaN where too few pixels determine it.
     """
     lines = lines_nm(height_um, fast_axis)
     pixel_nm = _fine_sd(_fine(_fine(lines, 0), 1))
@@ -42,7 +42,7 @@ def _fine(values: Array, axis: int) -> Array:
 
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
-    """Differences of an order along an axis; white noise keeps its variance, a polynomial below it is 0."""
+    """Differences of an order along an axis: white noise keeps its variance, lower polynomials vanish."""
     return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 
 
@@ -51,6 +51,6 @@ def _fine_sd(differences: Array) -> float:
 
 
 def robust_sd(values: Array) -> float:
-    """Standard deviation by the median of the distances from the median, NaN left out; NaN of none."""
+    """Standard deviation from the median absolute deviation, NaN left out; NaN without values."""
     known = values[np.isfinite(values)]
     return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

@@ -26,14 +26,14 @@ class Spectrum:
 def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
     """One-sided power spectral density along one axis, averaged over the lines.
 
-    Each line loses its mean and slope, is weighted by a Hann window (divided out in power), and its
-    spectrum is scaled so that ``Σ density·Δf`` is the mean square of the lines.
+    Mean and slope of each line are removed, and the line is weighted by a Hann window, whose power is divided
+    out. The spectrum is scaled so that ``Σ density·Δf`` is the mean square of the lines.
 
     Args:
         height_um: finite heights, µm, shape (ny, nx).
         pitch_um: pitch along the axis, µm.
         axis: ``x`` along rows, ``y`` along columns.
-        window: False keeps the lines as they are, for periodic or noise-like surfaces.
+        window: False leaves the lines unweighted, for periodic or noise-like surfaces.
 
     Raises:
         InputError: NaN in the surface, lines shorter than 8 pixels, or another axis.

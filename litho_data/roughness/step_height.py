@@ -1,4 +1,4 @@
-"""Step heights in the windows of ISO 5436-1: off the edges, with one common slope, line by line."""
+"""Step heights line by line in the windows of ISO 5436-1, away from the edges, with one common slope."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from litho_data.foundation.results import Record
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
-# Of a rough surface without step the largest change is 4 to 5 times the usual one.
+# On a rough surface without a step, the largest change is 4 to 5 times the usual one.
 _EDGE_SIGMA = 9.0
 
 
@@ -21,7 +21,7 @@ class StepHeight(Record):
         height_nm: mean over the lines.
         line_sd_nm: sd over the lines.
         uncertainty_nm: standard uncertainty of the mean, from the sd and the number of independent
-            lines; it does not contain the calibration of the z scale.
+            lines; it does not include the calibration of the z scale.
         lines: lines that were fitted.
     """
 
@@ -35,8 +35,8 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     """Height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
 
     On every line ``z = a·x + b + h·δ`` is fitted with δ = 1 on the middle third of the feature and
-    δ = 0 on two reference arms. With W the width of the feature, the arms lie W/3 to W off its edges,
-    so that the profile spans three widths.
+    δ = 0 on two reference arms. If W is the width of the feature, the arms lie W/3 to W off its edges, so
+    that the profile spans three widths.
 
     Args:
         height_um: heights, µm, shape (ny, nx); NaN is left out.
@@ -137,11 +137,11 @@ def _independent_lines(values: Array) -> float:
 
 
 def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
-    """Height of the steps of a step, ridge, groove or row of grooves, wherever its edges are.
+    """Mean height of the edges of a step, ridge, groove or row of grooves, wherever they are.
 
-    Edges are where the median profile changes by at least half of its largest change, the slope of the field
-    aside; their heights are those of ``stair_steps``, without sign, and averaged. The edges of one scan share
-    their treads, so the uncertainty of the mean is taken as that of one.
+    Edges are where the median profile, without the slope of the field, changes by at least half of its
+    largest change; their heights come from ``stair_steps`` and are averaged without sign. The edges of one
+    scan share their treads, so the uncertainty of the mean is taken as that of one edge.
 
     Raises:
         InputError: no edge stands out of the profile, or edges closer than three pixels.

@@ -14,10 +14,11 @@ FEWEST_LINES = 64
 # A peak is compared with the frequencies around it, beyond its own width under a Hann window.
 _AROUND = 16
 _OWN = 3
-# Powers k = 0, 1, 2 frequencies apart are correlated by 1, 4/9, 1/36 under a Hann window: share that is free.
+# Share of independent powers: under a Hann window, powers 0, 1, 2 frequencies apart correlate by 1, 4/9,
+# 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# The slowest frequencies are what levelling leaves of a bow.
+# The lowest frequencies hold what levelling leaves of a bow.
 _FIRST = 3
 
 
@@ -26,10 +27,11 @@ class LineDirection:
     """Direction of the lines of a surface.
 
     Args:
-        angle_deg: of the lines against the rows, from -90 (excluded) to 90; 0: along x, positive from x to y.
-        strength: length of the mean double-angle vector of the power spectrum; 0 for a surface alike in
-            all directions, 1 for lines of one direction.
-        p: chance of this strength in a surface alike in all directions (Rayleigh's test).
+        angle_deg: angle of the lines to the rows, from -90 (excluded) to 90; 0 is along x, positive from x to
+            y.
+        strength: length of the mean double-angle vector of the power spectrum; 0 for an isotropic surface, 1
+            for lines of one direction.
+        p: chance of this strength on an isotropic surface (Rayleigh's test).
     """
 
     angle_deg: float
@@ -43,11 +45,11 @@ class LinePeriod:
 
     Args:
         period_um: centre of the strongest peak over its surroundings.
-        share: of the squared means of the lines that is in the peak.
-        p: chance of such a peak anywhere in a spectrum that is smooth.
+        share: share of the squared line means that is in the peak.
+        p: chance of such a peak anywhere in a smooth spectrum.
         amplitude_um: root mean square over the surfaces of the amplitude at this period.
-        coherence: length of the mean of the surfaces' unit phasors at this period; 1 if all have one phase,
-            about 1 / √F if F surfaces have phases of their own.
+        coherence: length of the mean of the surfaces' unit phasors at this period; 1 if all have the same
+            phase, about 1 / √F if the phases of F surfaces are independent.
     """
 
     period_um: float
@@ -58,11 +60,11 @@ class LinePeriod:
 
 
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
-    """Direction in which surfaces of one kind change least, from their power spectra.
+    """Direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) counts with its power at twice its angle, each surface by its own variance. Random
-    surfaces have independent exponential powers, so the mean vector of one that is alike in all directions
-    is normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
+    Each frequency (fx, fy) is weighted by its power and enters at twice its angle; each surface is scaled by
+    its own variance. Random surfaces have independent exponential powers, so the mean vector of an isotropic
+    one is normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
 
     Args:
         heights_um: (ny, nx) µm on square pixels, levelled; NaN counts as the mean.
@@ -82,7 +84,7 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
 
 
 def _mean_vector(height_um: Array) -> tuple[complex, float]:
-    """Mean double-angle vector of the power of a surface, and its variance if all directions are alike."""
+    """Mean double-angle vector of the power of a surface, and its variance if the surface is isotropic."""
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
         raise InputError("surface", got=height.shape, wanted=f"at least {FEWEST_LINES} rows and columns")
@@ -93,7 +95,7 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
-    # Beyond the Nyquist frequency of an axis the square has corners only, in four directions.
+    # Beyond the Nyquist frequency of the axes only the corners of the square are left, in four directions.
     used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
     power, angle = power[used], np.arctan2(fy, fx)[used]
     total = power.sum()
@@ -104,14 +106,14 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
 
 
 def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
-    """The strongest period that the means of lines have in common, over all scans; None below 64 lines.
+    """The strongest period that the line means of all scans have in common; None below 64 lines.
 
-    The mean periodogram of F scans over its level is distributed as Gamma(F) / F where lines are random. The
-    level is a parabola through the logarithms of the frequencies around, whose uncertainty is integrated
-    over; the largest of all frequencies counts by Bonferroni.
+    If lines are random, the mean periodogram of F scans divided by its level is distributed as Gamma(F) / F.
+    The level is a parabola through the logarithms at the surrounding frequencies, and its uncertainty is
+    integrated out. The p of the largest of all frequencies is corrected by Bonferroni.
 
     Args:
-        means_um: mean height of each line, one array for each scan; the shortest decides on the length.
+        means_um: mean height of each line, one array per scan; all are cut to the shortest.
         pitch_um: distance of lines.
     """
     count, scans = min(len(own) for own in means_um), len(means_um)
@@ -121,7 +123,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
     spectra = np.stack(
         [np.abs(np.fft.rfft(taper * (own[:count] - own[:count].mean()))) ** 2 for own in means_um]
     )
-    # Scans differ in roughness: each counts by its own level.
+    # Scans differ in roughness, so each is divided by its own level.
     floor = np.finfo(float).tiny
     spectra = (spectra / np.maximum(np.median(spectra, axis=1, keepdims=True), floor))[:, _FIRST:]
     power = np.maximum(spectra.mean(axis=0), floor)
@@ -143,7 +145,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """Level of each frequency from those around it, and the chance that it lies so far above."""
+    """Level at each frequency from those around it, and the chance of a peak so far above the level."""
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)
     level, chance = np.empty(len(power)), np.empty(len(power))

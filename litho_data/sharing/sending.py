@@ -15,16 +15,16 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 
-# Of mallopt(3), with the values that the C library arrives at by itself where nobody sets one.
+# Options of mallopt(3), with the values that the C library reaches by itself if none is set.
 _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20)}
 
 
 @dataclass(frozen=True)
 class Known:
-    """Large objects that other processes make for themselves; jobs and results that hold them name them.
+    """Large objects that other processes make for themselves; jobs and results refer to them by name.
 
-    ``make``: importable by name, such as a partial; it gives ``objects`` again. A process
-    keeps those it made last.
+    ``make`` makes ``objects`` again; it must be importable by name, such as a partial. A process keeps the
+    objects that it made last.
     """
 
     make: Callable[[], Mapping[str, Any]]
@@ -63,14 +63,14 @@ def _made(make: bytes) -> Mapping[str, Any]:
 
 
 def sent(content: Any, names: Mapping[int, str]) -> bytes:
-    """Anything as bytes; ``names``: of the objects, by their ``id``, that are only named."""
+    """Anything as bytes; ``names``: names by ``id`` of the objects that are sent as their name only."""
     stream = BytesIO()
     _Sender(stream, names).dump(content)
     return stream.getvalue()
 
 
 def received(content: bytes, objects: Mapping[str, Any]) -> Any:
-    """What was sent, with these objects in the places of their names."""
+    """What was sent, with these objects in place of their names."""
     return _Receiver(BytesIO(content), objects).load()
 
 
@@ -93,12 +93,13 @@ class _Receiver(pickle.Unpickler):
 
 
 def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
-    """Refuse a Dask worker whose results would differ; asked with each job, as workers come and go."""
+    """Refuse a Dask worker whose results would differ; checked with each job, as workers come and go."""
     from distributed import get_worker
 
     worker = get_worker()
     if worker.state.nthreads > 1:
-        # Seeds and numbers of threads belong to a process, so jobs in its threads would disturb each other.
+        # Seeds and thread counts belong to a process, so jobs in several of its threads would disturb each
+        # other.
         raise InputError(
             f"Dask worker {worker.address}",
             got=f"{worker.state.nthreads} threads",
@@ -125,8 +126,8 @@ def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
 def _keep_freed_memory() -> None:
     """Let a Dask worker use freed memory again, as other processes do.
 
-    Dask starts its workers with MALLOC_TRIM_THRESHOLD_, which has every array above 128 KiB made of new
-    pages: a third of the time of a build.
+    Dask starts its workers with MALLOC_TRIM_THRESHOLD_, so that every array above 128 KiB gets new pages,
+    which takes a third of the time of a build.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)):
         for parameter, value in _MALLOC.values():

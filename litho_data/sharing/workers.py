@@ -30,16 +30,16 @@ from litho_data.sharing.sending import Away, Known, received, sent
 J = TypeVar("J")
 R = TypeVar("R")
 
-# What the numerical libraries read when they are loaded; a Dask worker has these values too.
+# Variables that the numerical libraries read when they are loaded; Dask workers get the same values.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CONNECT_S = 5.0
 _TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that take jobs: how many there are now, and the errors of a job lost with its worker.
+    """Workers that take jobs: their present number, and the errors that mean a job was lost with its worker.
 
-    ``tries``: how often a job is begun, ``restart``: called before those that were lost are begun again.
+    ``tries``: how often a job is begun; ``restart``: called before lost jobs are begun again.
     """
 
     submit: Callable[..., Future[bytes]]
@@ -52,12 +52,13 @@ class Pool(NamedTuple):
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run. With as many threads in each process the results are the same, to the bit.
+    """Where jobs run. Results are the same to the bit if each process has the same number of threads.
 
     Attributes:
-        processes: local ones, of one thread unless the environment says otherwise; 1 is this process.
+        processes: number of local processes, with one thread each unless the environment says otherwise; 1 is
+            this process.
         dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
-        known: what jobs hold and need not be sent.
+        known: objects in jobs that need not be sent.
         pool: see ``kept_open``.
     """
 
@@ -90,12 +91,12 @@ def run_jobs(
     """Each job with its result, in the order in which they are finished.
 
     At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
-    worker died is run again, alone, twice at most; Dask does so as often as its scheduler allows.
+    worker died is run again, alone, at most twice; Dask repeats it as often as its scheduler allows.
 
     Args:
         function: importable by name; jobs and results can be pickled.
         name: what messages call a job.
-        apart: the function waits for a process of its own, so that threads will do for local workers.
+        apart: the function starts a process and waits for it, so that local workers can be threads.
 
     Raises:
         InputError: no scheduler at the address, a worker of other software or with several threads, or a job
@@ -122,7 +123,7 @@ def run_jobs(
 def _tried(
     submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
 ) -> Iterator[tuple[int, R]]:
-    """The numbers of jobs with their answers; those lost with a worker are tried again, one by one."""
+    """The numbers of jobs with their answers; jobs lost with a worker are tried again, one by one."""
     tries: Counter[int] = Counter()
 
     def begin(number: int) -> Future[R]:
@@ -162,7 +163,7 @@ def _tried(
 
 @contextmanager
 def kept_open(workers: Workers) -> Iterator[Workers]:
-    """The same workers, started once for all the jobs of a block; those that cannot be had are told at once.
+    """The same workers, started once for all jobs of the block; workers that cannot start raise at once.
 
     Raises:
         InputError: no scheduler at the address, or no worker there.
@@ -177,7 +178,7 @@ def kept_open(workers: Workers) -> Iterator[Workers]:
 def _windowed(
     submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
 ) -> Iterator[tuple[J, Future[R]]]:
-    """Jobs as they are finished, two for each of ``count()`` workers under way."""
+    """Jobs as they finish, with two in progress for each of ``count()`` workers."""
     waiting = iter(jobs)
     running: dict[Future[R], J] = {}
 
@@ -232,7 +233,7 @@ def _local(count: int, apart: bool) -> Iterator[Pool]:
 
 
 def _die_with_parent() -> None:
-    """Workers of a killed parent would otherwise wait forever for their next job."""
+    """End this worker with its parent; after a killed parent it would wait forever for its next job."""
     from multiprocessing import parent_process
 
     def watch() -> None:
@@ -254,7 +255,7 @@ def _dask(address: str) -> Iterator[Pool]:
         _require_scheduler(address)
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, MemoryError) as error:
-        # MemoryError: another program answers there, and its words are taken for sizes.
+        # MemoryError: another program answers at the address, and its bytes are taken for sizes.
         said = str(error) or f"no answer in {_CONNECT_S:g} s"
         raise InputError(
             "Dask scheduler", got=f"none at {address} ({said})", wanted="for example tcp://host:8786"
@@ -263,7 +264,7 @@ def _dask(address: str) -> Iterator[Pool]:
     def count() -> int:
         try:
             return len(client.nthreads())
-        except OSError:  # the jobs under way tell that the scheduler is gone
+        except OSError:  # the jobs in progress report that the scheduler is gone
             return 0
 
     with client:
@@ -284,13 +285,13 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Ask who is there: a client that meets another program waits long, and its end is a traceback."""
+    """Check what answers at the address: a client that meets another program waits long, then crashes."""
     from distributed.core import rpc
 
     async def ask() -> None:
         async with rpc(address) as scheduler:
             await asyncio.wait_for(scheduler.identity(), _CONNECT_S)
 
-    # In a thread of its own: a notebook has a loop already.
+    # In a thread of its own, because a notebook already runs an event loop.
     with ThreadPoolExecutor(1) as thread:
         thread.submit(asyncio.run, ask()).result()

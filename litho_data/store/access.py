@@ -22,7 +22,7 @@ def open_root(path: str | Path) -> zarr.Group:
     """The root group of a store, read-only, without trusting consolidated metadata.
 
     Raises:
-        InputError: not there, or not a Zarr v3 group.
+        InputError: no such path, or not a Zarr v3 group.
     """
     import zarr
     from zarr.storage import ZipStore
@@ -87,7 +87,7 @@ def decoded(array: zarr.Array, selection: Any, what: str) -> Array:
     """A selection of an array.
 
     Raises:
-        InputError: a stored chunk that does not decode; the message says what it belongs to.
+        InputError: a stored chunk that does not decode; the message names its array.
     """
     try:
         return np.asarray(array[selection])
@@ -109,7 +109,7 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
 
 
 def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """The one-dimensional arrays of a group as a table, the column ``first`` in front.
+    """The one-dimensional arrays of a group as a table, with the column ``first`` in front.
 
     Raises:
         InputError: damaged metadata or chunks, or columns of different lengths.

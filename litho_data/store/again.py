@@ -1,4 +1,4 @@
-"""Scans of a store as other processes find them, so that they need not be sent."""
+"""References to scans of a store, which other processes read instead of receiving the arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.store.read import PrintedScan, Store, open_store
 
 @dataclass(frozen=True)
 class StoredScans:
-    """Some scans of a store: where it is, the hash of the dataset, and their ids."""
+    """Some scans of a store: path of the store, hash of the dataset, ids of the scans."""
 
     path: str
     sha256: str
@@ -19,14 +19,14 @@ class StoredScans:
 
     @classmethod
     def of(cls, store: Store, scans: Sequence[PrintedScan]) -> StoredScans:
-        """Where these scans were read."""
+        """The reference to these scans."""
         return cls(str(store.path), store.sha256, tuple(scan.id for scan in scans))
 
     def read(self) -> list[PrintedScan]:
         """The scans.
 
         Raises:
-            InputError: no store there, or one of another dataset.
+            InputError: no store at the path, or one of another dataset.
         """
         store = open_store(self.path)
         if store.sha256 != self.sha256:

@@ -1,4 +1,4 @@
-"""A store is complete or refused: every file that it declares is there, and every number can be one."""
+"""A store is refused unless it has every file that it declares and every number is possible."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def require_complete(path: Path) -> None:
     """Refuse a store that has lost a file: zarr would read zeros or NaN in its place.
 
     Raises:
-        InputError: with the first file that is missing.
+        InputError: names the first missing file.
     """
     for name in missing_files(path):
         raise InputError(
@@ -62,7 +62,7 @@ def require_complete(path: Path) -> None:
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Names of files that a store declares and does not have: documents of groups and arrays, and chunks."""
+    """Names of files that a store declares but lacks: documents of groups and arrays, and chunks."""
     names = file_names(path)
     with damaged(f"metadata of {path}"):
         documents = {name: json.loads(content) for name, content in read_documents(path, names)}
@@ -82,7 +82,8 @@ def missing_files(path: Path) -> Iterator[str]:
 def _may_be_left_out(name: str, document: Mapping[str, Any]) -> bool:
     """Whether a copy by xarray, which has no groups, may lack the chunk of this array.
 
-    It writes none of nothing but fill values: order 0 of a single scan, and what no scan of a part states.
+    It writes no chunk that holds only fill values, such as order 0 of a single scan, or a column that no scan
+    of a part states.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
@@ -96,7 +97,7 @@ def file_names(path: Path) -> set[str]:
     """
     if path.is_dir():
         found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
-        # A link that leads nowhere is no file.
+        # A dangling link is no file.
         return {file.relative_to(path).as_posix() for file in found if file.is_file()}
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
@@ -129,7 +130,7 @@ def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _by_xarray(attributes: Mapping[str, Any]) -> bool:
-    """Whether xarray wrote this array of truth values: it makes them small integers, and says so."""
+    """Whether xarray wrote this array of booleans: it stores them as small integers and says so."""
     return attributes.get("dtype") == "bool"
 
 
@@ -154,7 +155,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
-    """The arrays over all scans by name; InputError where one is missing or of another shape, type, order."""
+    """The arrays over all scans by name; InputError if one is missing or has another shape, type or order."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -178,10 +179,10 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
     """Refuse a copy whose pixels are not those of the layouts, by the coordinates that it carries.
 
-    What the store says of places, such as the transforms of the scans, is told from the first pixel.
+    Positions in the store, such as the transforms of the scans, count from the first pixel.
 
     Raises:
-        InputError: rows or columns were left out or turned round.
+        InputError: rows or columns were left out or reversed.
     """
     for name, count in zip(("y_um", "x_um"), shape, strict=True):
         if has_child(root, name):
@@ -196,8 +197,8 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     """``scan`` (the ids), ``print``, ``order`` and the optional columns, None where a number is not stated.
 
     Raises:
-        InputError: no scan, an id twice or with a path in it, columns of other lengths, or a number that
-            can be none.
+        InputError: no scan, an id that repeats or holds a path, columns of other lengths, or an impossible
+            number.
     """
     columns: dict[str, list[Any]] = {
         name: [require_plain_name(f"{name} of {path}", str(value)) for value in values_of(root, name)]
@@ -232,7 +233,7 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """(ny, nx) of every scan without its padding; InputError where one is no part of the padded field."""
+    """(ny, nx) of every scan without padding; InputError if one does not fit into the padded field."""
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
     quality = group_of(root, "quality")
@@ -247,10 +248,10 @@ def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...
 
 
 def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> None:
-    """Refuse the arrays of a scan that show no print: levels that are none, or nothing measured.
+    """Refuse the arrays of a scan that show no print: impossible levels, or nothing measured.
 
     Raises:
-        InputError: a level above the highest, a transform or a height that can be none, or no measured pixel.
+        InputError: a level above the highest, an impossible transform or height, or no measured pixel.
     """
     highest = int(samples["mask_level"].max())
     if highest >= levels:
@@ -268,10 +269,10 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 
 
 def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
-    """Refuse a manifest without what its readers take from it; one that is a table alone is of no build.
+    """Refuse a manifest that lacks what its readers need; a manifest with only a table is not from a build.
 
     Raises:
-        InputError: with the first thing that is missing or of another kind.
+        InputError: names the first entry that is missing or of another kind.
     """
     with damaged(f"manifest of {path}"):
         texts: list[Any] = []
@@ -285,4 +286,4 @@ def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
             if pitch is not None:
                 PITCH_UM.require("pitch_um", [pitch[0], pitch[1]])
         if not all(isinstance(text, str) for text in texts):
-            raise TypeError("a number in the place of a text")
+            raise TypeError("a number instead of a text")

@@ -1,7 +1,7 @@
 """The lock box: scans of a dataset that no choice of a model or an effect may use.
 
-Every choice follows from a hash of the ids. It depends on no library's random generator, so the
-same ids always give the same lock box.
+The choice follows from a hash of the ids, not from a library's random generator, so the same ids always give
+the same lock box.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from litho_data.foundation.errors import InputError
 
 
 class HasPrint(Protocol):
-    """What the draw needs of a scan: its id, and the print it is from."""
+    """What the draw needs of a scan: its id and its print."""
 
     @property
     def id(self) -> str: ...
@@ -21,12 +21,12 @@ class HasPrint(Protocol):
 
 
 def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
-    """The lock box of a dataset; give it all the scans."""
+    """The lock box of a dataset; takes all of its scans."""
     return lock_box([scan.id for scan in scans], [scan.print_id for scan in scans])
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """A sixth of the scans, at least one, from different prints as far as there are; none of one or two.
+    """A sixth of the scans, at least one, from different prints if possible; empty for one or two scans.
 
     Args:
         ids: scan ids; ``print_ids``: the print of each, same length.
@@ -49,7 +49,7 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
 
 
 def drawing_key(name: str, seed: int) -> str:
-    """A key to sort names by: the same names in the same order on every machine, another per seed."""
+    """A key to sort names by; the order is the same on every machine and differs between seeds."""
     return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
 
@@ -57,7 +57,7 @@ def require_unique(ids: Sequence[str]) -> None:
     """Refuse ids that repeat.
 
     Raises:
-        InputError: with the ids that do.
+        InputError: names the ids that repeat.
     """
     if len(set(ids)) != len(ids):
         repeated = sorted({scan_id for scan_id in ids if list(ids).count(scan_id) > 1})

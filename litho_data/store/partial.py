@@ -38,7 +38,7 @@ class Piece:
 
 
 def outputs_of(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What the steps of a scan's record have made: name, hash, shape, …"""
+    """The outputs of the steps of a scan's record: name, hash, shape, …"""
     return [output for step in record["steps"] for output in step["outputs"]]
 
 
@@ -73,7 +73,7 @@ class PartialStore:
                 if child.name != "scans":
                     shutil.rmtree(child) if child.is_dir() else child.unlink()
         root = zarr.open_group(self.store, mode="a", zarr_format=3)
-        # Several processes add to it.
+        # It exists already, because several processes add to it.
         root.require_group("scans")
         return root
 
@@ -82,7 +82,7 @@ class PartialStore:
 
         Args:
             root: the growing group.
-            keys: per id that is to be built, a function that returns its key; other ids are removed.
+            keys: for each id to build, a function that returns its key; other ids are removed.
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):
@@ -123,7 +123,7 @@ class PartialStore:
         self.discard()
 
     def discard(self) -> None:
-        """Leave nothing behind."""
+        """Remove the unfinished store."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _intact(self, root: zarr.Group, record: Mapping[str, Any]) -> bool:

@@ -1,4 +1,4 @@
-"""One printed field as everything in this project sees it, and the key of the whole of it."""
+"""One printed field as the whole project uses it, and the key of all its content."""
 
 import math
 from collections.abc import Mapping
@@ -27,18 +27,18 @@ class PrintedScan:
         write: the card's ``[write]`` table; None if it has none.
         field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
             None if the card does not state it.
-        turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
-            ``tip``: number of the tip, ``pixel_size``: of the scan, relative to the others; None as above.
-        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
-        tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
-        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
-            NaN where not valid, None if the store has none.
-        groups: what the card's pattern of ids says beside the print, such as the field; by name.
-        instrument: that scanned it, if the card's table names it; ``seen_by``: what kind it is, which says
+        turned_deg: rotation of the scan relative to the others; ``direction``: 1 trace, -1 retrace; ``tip``:
+            number of the tip; ``pixel_size``: pixel size of the scan relative to the others; None as above.
+        bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
+        tip_radius_um: radius of the microscope's tip, or its upper bound; None if the store does not say.
+        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um`` apart from the scan's
+            offset; NaN where not valid, None if the store has none.
+        groups: what the card's pattern of ids says in addition to the print, such as the field; by name.
+        instrument: name of the instrument, if the card's table gives it; ``seen_by``: its kind, which says
             what the heights are (``Instrument``).
         surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 shows),
             ``continues`` (more of the print, so that the outermost pixels are not valid) or ``unknown``,
-            also if the card does not say.
+            which is also the default.
     """
 
     id: str
@@ -81,7 +81,7 @@ class PrintedScan:
 
     @property
     def quarter_turns(self) -> int:
-        """How often ``rot90`` turns the layout's grid into the scan's, 0 to 3, by its registration."""
+        """Number of ``rot90`` turns, 0 to 3, from the layout's grid to the scan's, by its registration."""
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
@@ -102,7 +102,7 @@ class PrintedScan:
 
 
 def scan_sha256(scan: PrintedScan) -> str:
-    """The one key of a scan, for caches, resumed work and ids of datasets: the hash of every field of it."""
+    """The one key of a scan, for caches, resumed work and dataset ids: the hash of all its fields."""
     return record_sha256(_hashed(scan))
 
 

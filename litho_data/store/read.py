@@ -59,7 +59,7 @@ def open_store(path: str | Path) -> Store:
     """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading; everything is read once.
 
     Raises:
-        InputError: not there, not a Zarr v3 group, a file that it declares is missing or damaged, or arrays
+        InputError: no such path, not a Zarr v3 group, a declared file that is missing or damaged, or arrays
             and attributes that break the store's contract.
     """
     root = open_root(path)
@@ -135,9 +135,9 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """Named groups of the card's pattern in an id, the print aside.
+        """Named groups of the card's pattern in an id, except for the print.
 
-        A pattern that repeats is not asked: one in a store from elsewhere might never come to an end.
+        A pattern with repetitions is not applied, because one in a store from elsewhere might never finish.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -177,17 +177,18 @@ class Store:
 
     @property
     def locked_ids(self) -> list[str]:
-        """Ids of the lock box: a sixth of the scans, from different prints, the same in every session."""
+        """Ids of the lock box: a sixth of the scans, from different prints, always the same."""
         return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Hash of the raw file of each of these scans, however they were levelled and registered.
+        """Hash of the raw file of each scan, independent of levelling and registration.
 
-        A scan whose file the store does not list is left out. Layouts do not count: one may be printed twice.
+        A scan whose file the store does not list is left out. Layouts are not hashed, because one may be
+        printed twice.
         """
         wanted = set(ids)
         rows = [row for row in self.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
-        # Only what was read as a scan has the facts of a reader.
+        # Only files that were read as scans have facts from a reader.
         return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
@@ -200,7 +201,7 @@ class Store:
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     def recorded_pitches_um(self) -> dict[str, YX]:
-        """Pitch (y, x) of the scans, references too, as their reader recorded it."""
+        """Pitch (y, x) of the scans, including references, as their reader recorded it."""
         pitches = {}
         for row in self.manifest.get("files", []):
             if pitch := _read_facts(row).get("pitch_um"):
@@ -233,11 +234,11 @@ class Store:
 
     @property
     def dataset_id(self) -> DatasetId:
-        """Name and hash, for the results that are made from this dataset."""
+        """Name and hash, for results made from this dataset."""
         return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:
-        """Hash of the dataset from the arrays as they are now."""
+        """Hash of the dataset, computed from the arrays as they are now."""
         facts = dataset_facts(self, self.instrument, self.write)
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
 

@@ -1,4 +1,4 @@
-"""The dataset store on one screen: arrays, dimensions, types, units, and the hash of a dataset."""
+"""The dataset store at a glance: arrays, dimensions, types, units, and the hash of a dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
 WRITE = "write_"
-"""Begins the attributes of the root that hold the card's ``[write]`` table."""
+"""Prefix of the root attributes that hold the card's ``[write]`` table."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Variable:
         return tuple(dim for dim in self.dims if dim != "scan")
 
     def sample_sha256(self, sample: Array) -> str:
-        """Hash of one scan's slice in its true shape, so padding and chunking have no influence."""
+        """Hash of one scan's slice in its true shape, so padding and chunking do not matter."""
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
 
 
@@ -52,7 +52,7 @@ SAMPLE_VARIABLES = (
 )  # fmt: skip
 SIGMA = Variable("height_sigma_um", ("scan", "y", "x"), "float32", "um",
                  "standard uncertainty of height_um, its offset aside")  # fmt: skip
-"""Not in stores made before 0.1.0 or from 8-bit pairs, and no part of the dataset's hash."""
+"""Missing in stores made before 0.1.0 or from 8-bit pairs, and not part of the dataset's hash."""
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layouts' grid."""
 SCAN_VARIABLES = (
@@ -76,7 +76,7 @@ SCAN_VARIABLES = (
              "scales along y, x and of heights: factor, its standard uncertainty; only if calibrated"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
 )  # fmt: skip
-# No unit for the whole of it; in hashes it counts as 1.
+# The array as a whole has no unit; hashes use 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = {
@@ -88,17 +88,17 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Numbers per scan from the card's table, and what they may be; coordinates, NaN where a row has none."""
+"""Numbers per scan from the card's table with their ranges; coordinates, NaN where a row has none."""
 Instrument = Literal["afm", "sem"]
-"""What heights are: measured by an atomic force microscope, or a film's height times its coverage of a
-pixel, from the edges in an electron micrograph."""
+"""What heights are: measured by an atomic force microscope (``afm``), or a film's height times its coverage
+of a pixel, from the edges in an electron micrograph (``sem``)."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What holds for all scans, as part of the dataset's hash.
+    """Facts about all scans, as part of the dataset's hash.
 
     Args:
         geometry: has ``pitch_um``, ``level_height_um`` and ``levels``; ``write``: the card's table.

@@ -1,4 +1,4 @@
-"""Writing a dataset store: one scan per chunk, as other tools copy it too; every chunk with a checksum."""
+"""Writing a dataset store: one scan per chunk, as other tools copy it; every chunk has a checksum."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import zarr
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
-"""What fills the place beyond a layout that is smaller than the largest."""
-# What an image of a scan shows.
+"""Fill values beyond the edge of a layout that is smaller than the largest."""
+# The arrays that can be the image of a scan.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 
@@ -34,12 +34,12 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Group ``scans/<id>``: what one scan looked like in its own frame, an image of OME-Zarr as well.
+    """Write the group ``scans/<id>``, one scan in its own frame; it is also an image of OME-Zarr.
 
     Args:
         root: an open group.
         scan_id: name of the scan.
-        arrays: in its own frame, by name; others are passed over.
+        arrays: arrays in its own frame, by name; others are ignored.
         use: as in the card's table.
         pitch_um: (y, x) of the scan.
     """
@@ -66,13 +66,13 @@ def write_samples(
     load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
-    """The arrays over all scans, streamed one scan at a time.
+    """Write the arrays over all scans, one scan at a time.
 
     Args:
         root: an open group.
         scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers and
-            words) and ``arrays`` (names of what was made of it).
-        load: the sample arrays of an id.
+            words) and ``arrays`` (names of the arrays made from it).
+        load: gives the sample arrays of an id.
         pitch_um: pitch of the layout grid, µm.
     """
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
@@ -104,7 +104,7 @@ def write_samples(
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "units": "um"}
         centres = pixel_centres_um(count, pitch_um)
         write_numbers(root, f"{axis}_um", centres, axis, attributes=described)
-        # By the CF conventions one coordinate of an array names the axis.
+        # By the CF conventions, one coordinate of an array names the axis.
         write_numbers(root, axis, centres, axis, attributes={**described, "axis": axis.upper()})
 
 
@@ -147,7 +147,7 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array:
     """A new array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unseen.
 
-    By default a chunk of nothing but fill values has no file, and would look like one that was lost.
+    By default a chunk of fill values only has no file, and would look like a lost one.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -160,7 +160,7 @@ def consolidate(root: zarr.Group) -> None:
     import zarr
 
     with warnings.catch_warnings():
-        # zarr-python says that other readers may not know the copy; they read the single documents.
+        # zarr-python warns that other readers may not know the copy; these read the single documents.
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(root.store)
 
@@ -171,7 +171,7 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
     attributes = {**unit, "long_name": variable.long_name}
     if variable.dims[:2] == ("scan", "y"):
         attributes["coordinates"] = "print order y_um x_um"
-    # A scan's own frame has other sizes than the layouts: in one tree its axes need other names.
+    # A scan's own frame has other sizes than the layouts, so within one tree its axes need other names.
     frame = {} if variable.dims[0] == "scan" else _OWN_FRAME
     names = tuple(frame.get(dim, dim) for dim in variable.dims)
     return _array(

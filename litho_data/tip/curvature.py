@@ -8,9 +8,9 @@ import numpy as np
 from litho_data.foundation.kinds import YX, Array
 from litho_data.roughness.noise import fine_differences, robust_sd
 
-# Pixels: each size adds some to the disc before it.
+# Radii in pixels; each adds pixels to the disc before it.
 DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
-# Noise of a curvature that is quiet enough, as a share of the curvature of the tip.
+# Largest acceptable noise of a curvature, as a share of the curvature of the tip.
 QUIET = 0.17
 
 
@@ -24,9 +24,10 @@ class Noise:
 
 
 def noise_of(height_um: Array) -> Noise:
-    """Noise of a scan (ny, nx), µm, from fourth differences, which are 0 on a parabola: the print of a tip.
+    """Noise of a scan (ny, nx), µm, from fourth differences, which vanish on a parabola, as a tip leaves it.
 
-    What varies more down the columns than along the rows is an offset of whole rows, and the other way round.
+    An excess of variation down the columns over that along the rows is an offset of whole rows, and vice
+    versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
@@ -36,13 +37,13 @@ def noise_of(height_um: Array) -> Noise:
 def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
     """Highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
 
-    Exact for a quadratic surface, with the least noise of all linear estimates on the disc. NaN where the
-    disc leaves the scan or holds a pixel that was not measured.
+    It is exact for a quadratic surface and has the least noise of all linear estimates on the disc. NaN where
+    the disc leaves the scan or contains an unmeasured pixel.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
         pitch_um: (y, x).
-        radius_px: of the disc, pixels.
+        radius_px: radius of the disc, pixels.
     """
     from scipy.ndimage import binary_dilation
     from scipy.signal import oaconvolve
@@ -60,7 +61,7 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Standard deviation of a curvature of a flat scan with this noise, 1/µm; the larger of both axes."""
+    """Standard deviation of the curvature of a flat scan with this noise, 1/µm; the larger of both axes."""
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
         lines = kernel.sum(axis=1 if noise.lines_are_rows else 0)

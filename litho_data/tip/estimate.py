@@ -1,4 +1,4 @@
-"""The tip of one or more scans: its radius, or the most that it can be, and where it did not touch."""
+"""The tip of one or more scans: its radius or an upper bound, and where it did not touch."""
 
 import math
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ _SAME_PITCH = 1e-3
 
 
 class ScanUnderTip(Record):
-    """One scan: share of its pixels that the tip touched, and below which wavelength it may show the tip.
+    """One scan: the share of pixels that the tip touched, and the wavelength below which it may show the tip.
 
-    None where the image sets no bound on the tip; ``resolution_um`` also where the tip does not limit it.
+    Both are None if the image sets no bound on the tip; ``resolution_um`` also if the tip does not limit it.
     """
 
     name: str
@@ -34,17 +34,17 @@ class TipEstimate(RunFacts, Result):
     """What scans say about the tip that made them.
 
     Args:
-        kind: ``estimate`` where many places show the same end of the tip, else ``upper bound``.
-        radius_um: radius of the end of the tip, or the most that it can be; None if the scans set no bound.
+        kind: ``estimate`` if many places show the same end of the tip, else ``upper bound``.
+        radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of an estimate; None for a bound.
-        reason: why it is no more than a bound; empty for an estimate.
+        reason: why it is only a bound; empty for an estimate.
         depth_um: range of heights, without tilt and bow, of the scan behind the radius.
         reach_px: √(2 R depth) in pixels: how far the image of a spike reaches.
-        pixel_noise_nm, line_noise_nm: noise of the scans, root of the mean square.
+        pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
         window_px: side of the windows in which curvatures were measured; None without a bound.
-        share: of the sharp places that are as sharp as the sharpest; high where the tip makes them so.
+        share: share of the sharp places that are as sharp as the sharpest; high if the tip limits them.
         pitch_um: (y, x) of the scans.
-        scans: one by one.
+        scans: results for each scan.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/tip/1"
@@ -67,15 +67,15 @@ class TipEstimate(RunFacts, Result):
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     """The tip that made one or more scans, such as those of one day.
 
-    The radius comes from the sharpest tops: an image is nowhere more sharply curved than the end of its tip.
-    It is an estimate only where many tops have the same, largest curvature and the valleys have more;
-    otherwise the tip may be sharper than anything it met.
+    The radius comes from the sharpest tops, because an image is nowhere more sharply curved than the end of
+    its tip. It is an estimate only if many tops share the largest curvature and valleys exceed it; otherwise
+    the tip may be sharper than anything that it scanned.
 
     Args:
-        scans: with a pitch, all the same. Levelling is of little influence.
+        scans: scans with a pitch, the same for all. Levelling has little influence.
 
     Raises:
-        InputError: no scan, no pitch or another one, or a scan of fewer than 64 × 64 pixels.
+        InputError: no scan, a scan without pitch, different pitches, or a scan of fewer than 64 × 64 pixels.
     """
     pitch_um = _common_pitch(scans)
     heights = [scan.height_um for scan in scans]

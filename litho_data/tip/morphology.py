@@ -1,6 +1,6 @@
 """The surface under an image: a tip dilates what it scans, and eroding the image by the tip gives it back.
 
-A pixel that was not measured (NaN) takes no part.
+Unmeasured pixels (NaN) are ignored.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from litho_data.foundation.kinds import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A surface (ny, nx), and row and column of the image pixel that sets it, int32; NaN sets nothing."""
+    """A surface (ny, nx), and row and column of the pixel that sets each height, int32; NaN sets none."""
 
     surface: Array
     row: Array
@@ -21,8 +21,8 @@ class Eroded(NamedTuple):
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
     """The highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
 
-    A paraboloid is the sum of two parabolas, so that the minimum is taken along one axis after the other.
-    NaN stays NaN.
+    A paraboloid is the sum of two parabolas, so the minimum is taken along one axis after the other. NaN
+    stays NaN.
     """
     rows = np.broadcast_to(np.arange(image.shape[0], dtype=np.int32)[:, None], image.shape)
     measured = np.isfinite(image)
@@ -38,7 +38,7 @@ def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
 def _erode_rows(
     heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
 ) -> tuple[Array, Array]:
-    """Lowest of height + distance²/2R along rows, and the place of the pixel that it belongs to."""
+    """Lowest height + distance²/2R along rows, and the position of the pixel that gives it."""
     lowest, owner = heights.copy(), places.copy()
     # Farther away the tip is higher than all of the image.
     reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)

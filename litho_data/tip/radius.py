@@ -1,9 +1,9 @@
 """The radius of the end of a tip, from the sharpest tops of its images.
 
-Under a paraboloid tip the image plus x²/2R is convex along every line: no top is more sharply curved than
-1/R, and every corner and spike that is sharper than the tip is exactly as sharp. So the curvatures of an
-image end in an edge, which is clear where the tip sets it and a thin tail where the surface does. Curvatures
-are taken along the lines of the scan, where offsets of lines have no say.
+Under a paraboloid tip the image plus x²/2R is convex along every line: no top is curved more sharply than
+1/R, and every corner and spike sharper than the tip appears with exactly that curvature. So the distribution
+of an image's curvatures ends in an edge: a clear one if the tip sets it, a thin tail if the surface does.
+Curvatures are measured along the lines of the scan, where offsets of lines do not matter.
 """
 
 from collections.abc import Sequence
@@ -17,33 +17,34 @@ from litho_data.tip.curvature import QUIET, noise_of
 
 # Half sides of the square windows of a parabola, pixels.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# Half sides of a third of the reach average most and still fit on the image of an edge; not beyond 0.45.
+# Half sides of a third of the reach average most and still fit on the image of an edge, up to 0.45 of it.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The edge: 98 % of the curvatures beyond half of it lie below, noise adds 1.4 of its standard deviations
-# there.
+# The edge: 98 % of the curvatures above half of the edge lie below it; there, noise adds 1.4 of its standard
+# deviations.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
-# Where the scanner turns round, a line says little.
+# Near the scanner's turning points, a line says little.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Share of the tops beyond 0.4 of the edge that are within 0.8 of it. Surfaces that no tip limits: up to 0.16.
+# Share of the tops above 0.4 of the edge that exceed 0.8 of it; up to 0.16 on surfaces that no tip limits.
 _TIP_SHARE = 0.25
-# A tip is the same all over a scan, its few sharpest tops are not: that share times the share of the scan's
-# 5 x 5 parts whose own edge is within 0.9 of the whole one. Of rounded bumps, most estimates that are more
-# than 10 % too blunt have less; of steep walls and spikes one estimate in twenty.
+# A tip is the same all over a scan, a surface's few sharpest tops are not. So that share is multiplied by the
+# share of the scan's 5 x 5 parts whose own edge reaches 0.9 of the whole scan's. Of the estimates that are
+# more than 10 % too blunt, most on rounded bumps lie below this limit, but only one in twenty on steep walls
+# and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# Valleys under a tip are sharper than its tops; those of other surfaces, and of most noise, are not.
+# Under a tip, valleys are sharper than tops; on other surfaces, and in most noise, they are not.
 _SHARPER_VALLEYS = 1.2
-# Scatter of estimates of known tips beyond that of the parts of a scan.
+# Scatter of estimates of known tips in excess of the scatter among the parts of a scan.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 
 
 @dataclass(frozen=True)
 class PeakRadius:
-    """A radius, µm, None without any bound; ``reason``: why it is only a bound, empty if it is more.
+    """A radius, µm, None without any bound; ``reason``: why it is only a bound, empty for an estimate.
 
-    ``sd_um``: standard uncertainty; a bound lies twice that above what was found. ``depth_um``: range of
+    ``sd_um``: standard uncertainty; a bound lies twice that above the value found. ``depth_um``: range of
     heights; ``window_px``, ``share``: see ``TipEstimate``.
     """
 
@@ -56,7 +57,7 @@ class PeakRadius:
 
 
 def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
-    """The radius of the tip from one scan, or an upper bound, and what speaks against more.
+    """The radius of the tip from one scan, or an upper bound and the reason why it is no more.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured. Tilt and bow count as depth only.
@@ -89,10 +90,10 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 
 
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
-    """What several scans say about the one tip that made them: the mean of estimates, or the lowest bound.
+    """The tip that made several scans: the mean of the estimates, or the lowest bound.
 
-    Estimates well above the lowest come from rounded surfaces, and an estimate well above a bound of another
-    scan is refuted by it.
+    Estimates well above the lowest come from rounded surfaces and are dropped, and a bound from one scan
+    refutes estimates well above it from others.
     """
     known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
     estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
@@ -135,13 +136,13 @@ class _Tops:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
     def doubt(self, depth_um: float, pitch_um: YX) -> str:
-        """Why the edge may not be the tip's; empty if nothing speaks against it."""
+        """Why the edge may not come from the tip; empty if there is no doubt."""
         reach = self.reach_px(depth_um, pitch_um)
         if reach < _SMALLEST_REACH_PX:
             return f"such a tip reaches over {reach:.1f} pixels, fewer than {_SMALLEST_REACH_PX:.0f}"
         if self.half_px > _LARGEST_OF_REACH * reach:
             size = 2 * self.half_px + 1
-            return f"the noise asks for windows of {size} pixels, and the tip reaches over {reach:.1f}"
+            return f"the noise requires windows of {size} pixels, and the tip reaches over {reach:.1f}"
         if self.share < _TIP_SHARE:
             return (
                 f"{self.share:.0%} of the sharp tops are as sharp as the sharpest: the surface makes them so"
@@ -161,7 +162,7 @@ class _Tops:
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     from scipy.signal import savgol_coeffs
 
-    # Of the second derivative of the best parabola through a window.
+    # Weights of the second derivative of the best parabola through a window.
     weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
@@ -169,7 +170,7 @@ def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops
 
 
 def _along_lines(lines: Array, weights: Array) -> Array:
-    """Second derivative along the lines, mean of as many lines; only whole windows, NaN around gaps."""
+    """Second derivative along the lines, averaged over the lines of a window; NaN without a whole window."""
     from scipy.ndimage import correlate1d, uniform_filter1d
 
     size, half = len(weights), len(weights) // 2
@@ -184,7 +185,7 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Where the curvatures end, without what noise adds; 0 or less where noise is all there is."""
+    """Where the curvatures end, minus what noise adds; 0 or less if there is only noise."""
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:
         return 0.0

@@ -1,4 +1,4 @@
-"""The lateral resolution that a tip leaves to a scan."""
+"""The lateral resolution to which a tip limits a scan."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> f
     Args:
         height_um: (ny, nx), µm, NaN where not measured.
         pitch_um: (y, x).
-        radius_um: of the tip.
+        radius_um: radius of the tip.
 
     Returns:
         None if no peak is that sharp at any distance: the tip does not limit the scan.

@@ -23,13 +23,13 @@ def scan_surface(
 ) -> Array:
     """Height that the microscope reports for a surface given at its pixels, µm.
 
-    Lines are scanned from left to right (fast axis x; on the way back from right to left), the first line
-    on top. With smaller pixels the tip moves more slowly: what lags in time lags by a smaller length.
+    Lines are scanned from left to right (fast axis x; from right to left in retrace), the first line on top.
+    With smaller pixels the tip moves more slowly, so a lag in time becomes a shorter length.
 
     Args:
         surface_um: true height at the pixels of the scan, µm.
         job: what is scanned, in which direction and with which tip.
-        rng: draws of the default noise of this scan.
+        rng: generator of the default noise of this scan.
     """
     height, scan_index = surface_um, job.index
     if strength := (job.tip == 1) * knobs["tip-dilation"]:
@@ -59,7 +59,7 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Path of a paraboloid tip of radii along y and x: ``max_u h(x − u) − u²/2R``, also between pixels."""
+    """Path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``, also between pixels."""
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
     return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
@@ -99,7 +99,7 @@ def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> Array:
-    """Everything that is added to the height, independent of the surface, nm."""
+    """The sum of all contributions that do not depend on the surface, nm."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)

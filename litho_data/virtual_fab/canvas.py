@@ -1,4 +1,4 @@
-"""The area simulated around one layout, and spectral blurs on it."""
+"""The area that is simulated around one layout, and spectral blurs on it."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Exposure: hatch lines, slices and two-photon dose; what beam, galvo and field do to it."""
+"""Exposure: hatch lines, slices and two-photon dose, with the effects of beam, galvo and field."""
 
 import numpy as np
 import scipy.ndimage
@@ -77,7 +77,7 @@ def accumulate_dose(
     if strength := knobs["write-order-memory"]:
         decay_um = knobs.machine_rng("write-order-memory").uniform(1.0, 4.0)
         dose = dose - strength * _earlier_lines(dose, canvas.pitch_um, decay_um)
-    # Spectral filters undershoot zero by rounding, and no dose is negative.
+    # Rounding in spectral filters falls below zero, but no dose is negative.
     dose = np.maximum(dose, 0.0)
     if strength := knobs["dose-exponent"]:
         dose = dose ** (1 + strength)
@@ -88,28 +88,28 @@ def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
     """Exposure with every point of a hatch line at x + strength·x(1 − x/L), 0 ≤ x ≤ L the write field."""
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # Which point came to lie here: the root of x + strength·x(1 − x/L) = at that is 0 at 0.
+    # The point that is written here: the root of x + strength·x(1 − x/L) = at that vanishes at 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
     rows, columns = np.indices(nominal.shape, dtype=float)
     meant = columns + (meant_um - inside) / canvas.pitch_um
-    # The spot smooths what a cubic overshoots at the edges of levels.
+    # The spot smooths the overshoot of a cubic at the edges of levels.
     return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:
-    """First canvas pixel of each write field of a layout along one axis, the guard frame in the outermost."""
+    """First canvas pixel of each write field along one axis; the outermost fields include the guard frame."""
     return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Exposure (ny, nx) written field by field, each off its place: doses add up where fields overlap.
+    """Exposure (ny, nx) written field by field, each field displaced; doses add up where fields overlap.
 
     Args:
         starts: first row, and first column, of every field.
-        offset_px: (y, x) of every field, (fields along y, along x, 2). A pixel that comes to lie across four
-            gives each the share that it covers.
+        offset_px: (y, x) displacement of every field, (fields along y, along x, 2). The dose of a displaced
+            pixel is divided among the four pixels that it covers.
     """
     written = np.zeros_like(nominal)
     ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
@@ -151,7 +151,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Effective dose if every slice has to pass the threshold on its own."""
+    """Effective dose if every slice has to pass the threshold by itself."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):

@@ -15,7 +15,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs, their noise, and what is no knob."""
+    """A printer and a microscope with their knobs, their noise, and a cause that is no knob."""
 
     printer: Printer
     microscope: Microscope
@@ -78,5 +78,5 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Of where a scan lies, of the surface's roughness, of the microscope's noise."""
+    """Seeds of the scan's position, of the surface's roughness and of the microscope's noise."""
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

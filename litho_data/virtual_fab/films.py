@@ -1,7 +1,7 @@
-"""A fab for films: written by an electron beam or through a lens, etched, seen in an electron microscope.
+"""A fab for films written by an electron beam or through a lens, etched and seen in an electron microscope.
 
-It shares no code with the models: scattering is a product of spectra, a lens sums the images by the points of
-its source, and an edge is a distance that etching moves.
+It shares no code with the models: scattering is a product of spectra, a lens sums the images of the points of
+its source, and etching shifts the distance from an edge.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# Pixels of the image to one of the layout, where an edge is sought, and of the micrograph.
+# Pixels per layout pixel of the image in which edges are located, and of the micrograph.
 _FINER, _AROUND = 4, 64
 _RESIST = 30.0
-# Along each side of the source. With 9 edges lie 1.5 nm from their place, with 21 0.5 nm.
+# Points along each side of the source. With 9, edges are displaced by 1.5 nm; with 21, by 0.5 nm.
 _SOURCE_POINTS = 21
 _CARD = """name = "virtual-{process}"
 title = "Simulated films of the process {process}, with simulated micrographs"
@@ -49,14 +49,14 @@ surround = "unknown"
 
 @dataclass(frozen=True)
 class FilmKnobs:
-    """What a process may have beyond plain printing; lengths in µm.
+    """Effects of a process beyond plain printing; lengths in µm.
 
     Attributes:
-        backscatter: electrons (or stray light) that come back, relative to the dose; ``backscatter_um``: over
-            which length.
-        diffusion_um: sd by which what the dose made spreads.
+        backscatter: electrons (or stray light) scattered back, relative to the dose; ``backscatter_um``:
+            their range.
+        diffusion_um: sd of the diffusion of the exposed species.
         etch_bias_um: shift of every edge, outward.
-        defocus_um: of the lens; ``dose_error``: relative.
+        defocus_um: defocus of the lens; ``dose_error``: relative error of the dose.
         charging: relative change of brightness across a micrograph.
     """
 
@@ -71,7 +71,7 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine: process, sampling, film, beam (sd) or lens; threshold of the resist, of a full dose."""
+    """A machine: process, sampling, film, beam (sd) or lens, relative resist threshold."""
 
     process: Literal["e-beam", "projection"]
     pitch_um: float
@@ -103,10 +103,10 @@ class FilmTruth(Result):
 
 
 def film_knobs(words: Iterable[str]) -> FilmKnobs:
-    """Knobs of words ``name=value``.
+    """Knobs from words ``name=value``.
 
     Raises:
-        InputError: a name that is none, or a value that is no number.
+        InputError: an unknown name, or a value that is no number.
     """
     values = {}
     for name, value in (word.split("=", 1) if "=" in word else (word, "") for word in words):
@@ -119,7 +119,7 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Distance of the film's edge, positive on the film: of 4 × 4 places in each pixel of a layout, 0 or 1.
+    """Distance from the film's edge, positive on the film, at 4 × 4 places per pixel of a binary layout.
 
     The layout is periodic; distances are in pixels of the layout.
     """
@@ -137,7 +137,7 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
         turned = 1 / (1 + np.exp(-_RESIST * (field - threshold)))
         field, threshold = blur(turned, pitch, knobs.diffusion_um), 0.5
     fine = zoom(field, _FINER, order=3, mode="grid-wrap", grid_mode=True) > threshold
-    # Edges beyond the border count too: the layout goes on there.
+    # Edges beyond the border count too, because the layout continues there.
     fine = np.pad(fine, _AROUND, mode="wrap")
     inside, outside = distance_transform_edt(fine), distance_transform_edt(~fine)
     distance = np.where(fine, inside - 0.5, 0.5 - outside)[_AROUND:-_AROUND, _AROUND:-_AROUND]
@@ -205,7 +205,7 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
-    """Intensity of a mask, 1 where all is open: the mean of its images by the points of a round source."""
+    """Intensity behind a mask, 1 if it is open: the mean of the images from the points of a round source."""
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)
     sides = np.linspace(-1, 1, _SOURCE_POINTS)

@@ -50,8 +50,8 @@ def place_scan(
 ) -> ScanFrame:
     """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale.
 
-    ``turned_deg``: by how much the print lies turned under the microscope, on top of the small rotation;
-    ``pixel_size``: of the scan, in pixels of the layout.
+    ``turned_deg``: rotation of the print under the microscope, in addition to the small rotation;
+    ``pixel_size``: pixel size of the scan, in pixels of the layout.
     """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
@@ -77,7 +77,7 @@ def sample_surface(
     """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
-    # On the way back a piezo bulges the other way.
+    # In retrace a piezo bends the other way.
     if strength := direction * knobs["piezo-nonlinearity"]:
         x_um = x_um + strength * x_um * (1 - x_um / frame.size_um[1])
     (xx, xy, x0), (yx, yy, y0) = frame.scan_to_layout[:2]

@@ -22,7 +22,7 @@ from litho_data.virtual_fab.settings import Printer
 SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
-# Cut-offs of random layouts, taken in turn by the prints.
+# Cut-offs of random layouts; the prints use them in turn.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 
 
@@ -62,7 +62,7 @@ class Plan:
 
     @property
     def total(self) -> int:
-        """Number of scans, references included."""
+        """Number of scans, including references."""
         return self.count + 3 * self.references
 
 
@@ -116,19 +116,19 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """The layouts of a dataset card, with what its table says about printing and scanning them.
+    """Jobs for the layouts of a dataset card, printed and scanned as its table says.
 
     Rows of one print with the same layout are scans of one printed field if the table says how a scan was
     made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``).
 
     Args:
         path: the card.
-        first: number of the first scan: what is drawn for a scan or print goes by its number.
-        printer: which prints them; the default one if None.
+        first: number of the first scan; the random draws for a scan or print depend on its number.
+        printer: the printer that prints them; the default printer if None.
 
     Raises:
-        InputError: a bad card, no layout files, or layouts of a pitch or level height that the printer
-            does not write.
+        InputError: a bad card, no layout files, or layouts with a pitch or level height that the printer
+            cannot write.
     """
     card = load_card(path)
     printer = printer or Printer()

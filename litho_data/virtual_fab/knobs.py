@@ -21,7 +21,7 @@ OFF_CATALOGUE = "off-catalogue"
 
 @dataclass(frozen=True)
 class Knob:
-    """One effect that the fab can add; strength 0 does not change a bit.
+    """One effect that the fab can add; strength 0 leaves every bit unchanged.
 
     Args:
         name: on the command line and in the truth file.
@@ -31,8 +31,8 @@ class Knob:
         unit: unit of the strength.
         limit: largest meaningful strength.
         meaning: what a strength of one unit does, and what the seed draws.
-        nuisance_span: True if offset, gain, plane and bow of each scan absorb nearly all of it.
-        refit_absorbs: True if other parameters of the plain printing model imitate most of it.
+        nuisance_span: True if offset, gain, plane and bow of each scan absorb nearly all of the effect.
+        refit_absorbs: True if other parameters of the plain printing model imitate most of the effect.
     """
 
     name: str
@@ -47,13 +47,13 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """The largest strength as text, bare where the unit is 1."""
+        """The largest strength as text, without a unit if that is 1."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob turned to a strength; without its own seed it uses that of the run."""
+    """A knob set to a strength; without a seed of its own it uses that of the run."""
 
     name: str
     strength: float
@@ -110,11 +110,11 @@ class KnobBoard:
         return any(self[name] for name in names)
 
     def machine_rng(self, name: str) -> np.random.Generator:
-        """Draws of a knob for the machine: the same for every scan."""
+        """The random generator of a knob for the machine: the same for every scan."""
         return self._rng(name, 0)
 
     def scan_rng(self, name: str, scan_index: int) -> np.random.Generator:
-        """Draws of a knob that are new in every scan."""
+        """The random generator of a knob for one scan: new for every scan."""
         return self._rng(name, scan_index + 1)
 
     def _rng(self, name: str, stream: int) -> np.random.Generator:
@@ -125,4 +125,4 @@ KNOBS: dict[str, Knob] = {
     one["name"]: Knob(**one)
     for one in tomllib.loads(Path(__file__).with_name("knobs.toml").read_text(encoding="utf-8"))["knob"]
 }
-"""By name, in the order in which they are listed; the table is ``knobs.toml``."""
+"""All knobs by name, in the order of the listing; the table is ``knobs.toml``."""

@@ -15,7 +15,7 @@ from litho_data.virtual_fab.resist import develop
 from litho_data.virtual_fab.settings import Noise, Printer
 
 _SUBSTRATE_GRAIN_UM = 0.3
-# Of a square calibration grating: height, and width of its flanks.
+# A calibration grating of square profile: height, and width of its flanks.
 _GRATING_UM, _FLANK_UM = 0.5, 0.2
 
 
@@ -33,11 +33,11 @@ class Job:
         write_field_um: side of the write field, µm; None for a field as large as the layout.
         use: what the scan is for; nothing is printed for ``substrate``, nor for ``grating``, a standard.
         grating_um: period of that standard, µm.
-        print_index: number of the print in its set where one is scanned more than once; ``index`` if None.
-        turned_deg: by how much the print lies turned under the microscope, whole quarters.
-        direction: 1 for lines recorded on the way there, -1 on the way back.
+        print_index: number of the print in its set, if a print is scanned more than once; ``index`` if None.
+        turned_deg: rotation of the print under the microscope, a multiple of 90.
+        direction: 1 for trace, -1 for retrace.
         tip: number of the tip; every one after the first is new and sharp.
-        pixel_size: of the scan, in pixels of the layout; the time per pixel stays.
+        pixel_size: pixel size of the scan, in pixels of the layout; the time per pixel stays the same.
     """
 
     id: str
@@ -57,7 +57,7 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Number of the print, which decides what is drawn for it; the scan's own draws go by ``index``."""
+        """Number of the print, which decides its random draws; those of the scan depend on ``index``."""
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
@@ -67,10 +67,10 @@ class Job:
 
 
 class Cause:
-    """An effect that is no knob, for experiments of your own; as it stands it changes nothing.
+    """An effect that is no knob, for experiments of your own; this base class changes nothing.
 
-    A subclass overrides one stage or more. Each must follow from its arguments alone: a field is printed
-    and scanned more than once.
+    A subclass overrides one or more stages. A stage may depend only on its arguments, because a field is
+    printed and scanned more than once.
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:

@@ -5,14 +5,14 @@ import numpy as np
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
-# The spectrum of the measured prints' fine residual: a band of line-shaped features across the
-# hatch direction, 0.45 µm apart, and a slower part; both long along the hatch lines.
+# The spectrum of the measured prints' fine residual: a band of line-shaped features 0.45 µm apart across the
+# hatch direction, and a slower part; both are long along the hatch lines.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# What a 0.2 µm spot writes does not change faster than this along the line.
+# A 0.2 µm spot writes nothing that changes faster than this along the line.
 _SMOOTH_UM = 0.06
 
 
@@ -35,7 +35,7 @@ def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
 
 def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
     """Gaussian random field of a power spectrum given on the half plane; unit variance on average."""
-    # Columns other than 0 and the Nyquist one stand for two frequencies of the full plane.
+    # All columns but 0 and the Nyquist column stand for two frequencies of the full plane.
     doubled = np.full(psd.shape[1], 2.0)
     doubled[0] = 1.0
     if shape[1] % 2 == 0:

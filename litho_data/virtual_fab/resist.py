@@ -1,4 +1,4 @@
-"""Resist and development: conversion, diffusion, shrinkage, and what is lost or left behind."""
+"""Resist and development: conversion, diffusion, shrinkage, losses and residues."""
 
 import numpy as np
 import scipy.ndimage
@@ -15,8 +15,8 @@ _NARROW_UM = 1.5
 def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
     """Height of the developed, dried print above the zero of the scans, µm.
 
-    A column of resist converts along a logistic curve of its dose. On drying, it shrinks less in a denser
-    polymer network.
+    The conversion of a column of resist is a logistic function of its dose. On drying, a denser polymer
+    network shrinks less.
 
     Args:
         dose: two-photon dose on the canvas, 1 = full.
@@ -81,7 +81,7 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """What capillary forces and the developer do to narrow features and steep flanks."""
+    """The effects of capillary forces and of the developer on narrow features and steep flanks."""
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:
         surroundings = scipy.ndimage.grey_opening(height, size=(window_px, window_px), mode="nearest")

@@ -24,7 +24,7 @@ class Printer:
         network_reach_um: sd of the neighbourhood whose conversion determines how much a column shrinks, µm.
         loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps it all.
         base_um: height of the base layer's surface above the zero of the scans, µm.
-        stitch_field_um: side of the fields that a larger layout is written in one after the other, µm; the
+        stitch_field_um: side of the fields in which a larger layout is written one after the other, µm; the
             knob ``stitching`` displaces them.
     """
 
@@ -55,7 +55,7 @@ class Microscope:
         scale: largest relative error of each lateral scale.
         shear: largest shear.
         shift_um: largest shift along each axis, µm.
-        files: what it writes: ``text-matrix``, metres and nothing else, or ``gsf``, with size and unit.
+        files: format of its files: ``text-matrix``, heights in metres only, or ``gsf``, with size and unit.
     """
 
     margin_px: float = 14.0
@@ -131,7 +131,7 @@ PRESETS = {
         size_px=512,
         knobs=("slope-thinning-x=0.4", "scan-line-stripes=8", "tilt-bow=20", "min-to-zero-datum=1"),
     ),
-    # Other in all that a program could know by heart.
+    # Differs in everything that a program could have learnt by heart.
     "second-printer": Preset(
         count=5,
         size_px=(128, 192),

@@ -1,4 +1,4 @@
-"""A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth apart."""
+"""A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth separately."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -50,13 +50,13 @@ def simulate(
     """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
 
     ``out/raw`` is what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` holds what
-    only a simulation knows: `truth.json`, the clean prints and the rough ones. Scans are made one at a
+    only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are made one at a
     time, so memory does not grow with their number, and no scan depends on that number.
 
     Args:
         count: number of scans with random layouts.
         size_px: size of a layout, pixels (one number, or ny and nx).
-        seed: of every random draw of the run.
+        seed: seed of every random draw of the run.
         knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
         cause: an effect of your own that is no knob; the truth file does not know it.
         noise: ``default``, ``off``, or own standard deviations.
@@ -70,8 +70,8 @@ def simulate(
         metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
 
     Raises:
-        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder with a run of
-            other settings or something else in it.
+        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder that holds a run
+            with other settings or something else.
     """
     require_known("metadata", metadata, ("full", "files-only"))
     if references and metadata != "full":
@@ -158,7 +158,7 @@ def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
         write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
-# Not turned, on the way there, with the first tip and the pixels of the layout.
+# Not turned, in trace, with the first tip and the pixel size of the layout.
 AS_EVER = (0.0, 1.0, 1.0, 1.0)
 
 
@@ -175,7 +175,7 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
 
 
 def _described(job: Job) -> dict[str, Any]:
-    """All that a job says, its layout by its hash."""
+    """All fields of a job, with the hash in place of its layout."""
     return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
@@ -197,7 +197,7 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """The card's table; how a scan was made stands in it where one was made otherwise."""
+    """Write the card's table; it says how scans were made if any was made in another than the usual way."""
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
     write_table(raw, columns, [row[: len(columns)] for row in rows])
@@ -219,14 +219,14 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
     """Print and scan a plan in the fab of an earlier run; returns the path of the new card.
 
-    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is a new one: what
-    is drawn for single prints and scans is drawn afresh.
+    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is new: draws for
+    single prints and scans are made afresh.
 
     Args:
         plan: folder with ``card.toml``, layouts and ``scans.csv``, as `litho-models next-print` writes it.
         fab: folder of the earlier run, with its ``truth``.
         out: where ``raw`` and ``truth`` of the new run go.
-        seed: of the new draws; another than the earlier run's.
+        seed: seed of the new draws; must differ from the earlier run's.
 
     Raises:
         InputError: no plan, no truth, the seed of the earlier run, or layouts that its printer cannot write.

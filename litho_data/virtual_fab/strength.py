@@ -13,7 +13,7 @@ from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
-# Noise by nature: no noise-free scan shows it, its strength is its rms.
+# Knobs that are noise: no noise-free scan shows them, and their strength is their rms.
 NOISE_KNOB = "line-roughness"
 _RELATIVE_PRECISION = 0.01
 _MAX_STEPS = 40
@@ -21,7 +21,7 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """A strength and its rms. ``rms_nm`` is smaller than requested if the knob's range ends first."""
+    """A strength and its rms. ``rms_nm`` is smaller than requested if the knob's range does not reach it."""
 
     setting: KnobSetting
     rms_nm: float
@@ -46,8 +46,8 @@ def strength_for_rms(
         seed: seed of the knob.
 
     Raises:
-        InputError: an unknown knob, an rms that is not positive, or a knob of which the terms of single scans
-            leave no trace.
+        InputError: an unknown knob, an rms that is not positive, or a knob that offset, gain, plane and bow
+            of single scans absorb completely.
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
@@ -62,7 +62,7 @@ def strength_for_rms(
         strength = min(rms_nm, highest)
         return KnobStrength(KnobSetting(name, strength, seed), strength)
     at_limit = measured(highest)
-    # Remainders of float32 size are no trace of the effect.
+    # Remainders at the rounding of float32 are no trace of the effect.
     if at_limit < 1e-3:
         raise InputError(
             f"knob {name}", got="no trace beside offset, gain, plane and bow", wanted="another knob"
@@ -81,11 +81,12 @@ def search_strength(
     at_highest: float,
     precision: float = _RELATIVE_PRECISION,
 ) -> tuple[float, float]:
-    """The strength below ``highest`` at which a growing measure is ``wanted``, and what it is there.
+    """The strength below ``highest`` at which a growing measure reaches ``wanted``, and the measure there.
 
     Args:
-        measured: the measure at a strength; ``at_highest``: at ``highest``, more than ``wanted``.
-        precision: how close to ``wanted``, relative.
+        measured: gives the measure at a strength; ``at_highest``: the measure at ``highest``, above
+            ``wanted``.
+        precision: largest relative distance from ``wanted``.
     """
     low, high = 0.0, highest
     # Most effects grow about linearly, some quadratically: the first guess assumes linear growth.
@@ -103,7 +104,7 @@ def search_strength(
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
     """Rms over the scans of (noise-free scan with the knob) − (without), without nuisances, nm.
 
-    Scans are aligned with the layout, so a warp counts by the heights it changes. The least-squares
+    Scans are aligned with the layout, so a warp counts by the heights that it changes. The least-squares
     fit of {1, P, x, y, x², xy, y²} is removed from each scan, P the scan without the knob.
     """
     mean_squares = []
@@ -126,7 +127,7 @@ def _free_of_nuisances(change: Array, prediction: Array) -> Array:
 
 
 def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
-    """Four fields of 256 × 256 px: first, two middle ones and last of a print order, two of each cut-off."""
+    """Four fields of 256 × 256 px, two of each cut-off: first, two middle ones and last of a print order."""
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 
 

@@ -14,7 +14,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 
 class KnobTruth(Record):
-    """One knob that was not at zero."""
+    """One knob with a strength other than zero."""
 
     name: str
     effect: str
@@ -26,7 +26,7 @@ class KnobTruth(Record):
 
     @classmethod
     def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
-        """The knob of a setting, with the seed that was used."""
+        """The record of a setting, with the seed that was used."""
         knob = KNOBS[setting.name]
         return cls(
             name=knob.name,
@@ -40,12 +40,12 @@ class KnobTruth(Record):
 
     @property
     def setting(self) -> KnobSetting:
-        """The knob with the seed that was used, to turn it again."""
+        """The setting with the seed that was used, to repeat it."""
         return KnobSetting(self.name, self.strength, self.seed)
 
 
 class ScanTruth(Record):
-    """One scan: position, datum, and the error that perfect models of print and microscope would make."""
+    """One scan: position, datum, and the remaining error of perfect models of print and microscope."""
 
     id: str
     use: str
@@ -64,7 +64,7 @@ class ScanTruth(Record):
 class Truth(Result):
     """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid. ``settings``: what else was asked for, None in older files.
+    Both are heights in µm on the layout grid. ``settings``: further settings of the run; None in older files.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"

@@ -30,7 +30,7 @@ from litho_design.exports.formats import Format
 if TYPE_CHECKING:
     from litho_design.judging.score import ScoreResult
 
-app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
+app = new_app("Design diffractive optics through a frozen model of the printer, score and export them.")
 app.command()(first)
 app.command()(hoe)
 app.command()(lens)
@@ -63,22 +63,30 @@ def score(
     ] = 0.02,
     scan_tip_um: Annotated[
         float | None,
-        typer.Option(help="radius of the tip, µm; 0 for none. By default what the scan tells", hidden=True),
+        typer.Option(
+            help="radius of the tip, µm; 0 for none. By default estimated from the scan", hidden=True
+        ),
     ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(help="photograph of the printed hologram's image, or through the printed lens"),
     ] = None,
-    camera_pitch_um: Annotated[float | None, typer.Option(help="its pixel in the image plane, µm")] = None,
+    camera_pitch_um: Annotated[
+        float | None, typer.Option(help="pixel of the photograph in the image plane, µm")
+    ] = None,
     camera_pitch_sd: Annotated[
         float,
-        typer.Option(help="relative uncertainty of that, where the magnification is not sure", hidden=True),
+        typer.Option(
+            help="relative uncertainty of that pixel, if the magnification is uncertain", hidden=True
+        ),
     ] = 0.0,
     camera_flat: Annotated[
         Path | None,
-        typer.Option(help="photograph of an even light by the same camera, against vignetting"),
+        typer.Option(help="photograph of uniform light by the same camera, to correct vignetting"),
     ] = None,
-    camera_dark_level: Annotated[float | None, typer.Option(help="its dark level, counts")] = None,
+    camera_dark_level: Annotated[
+        float | None, typer.Option(help="dark level of the photograph, counts")
+    ] = None,
     camera_object: Annotated[
         str | None,
         typer.Option(help="object in front of the lens: one of the design's objects by name, or a picture"),
@@ -86,8 +94,8 @@ def score(
     camera_orientation: Annotated[
         str,
         typer.Option(
-            help="what brings the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
-            "flip-y, transpose or anti-transpose. One that fits another orientation better is refused"
+            help="operation that makes the photograph upright: identity, rotate-90, rotate-180, rotate-270, "
+            "flip-x, flip-y, transpose or anti-transpose; refused if another one fits better"
         ),
     ] = "identity",
     camera_power: Annotated[
@@ -100,16 +108,16 @@ def score(
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="optics of the judges: thin, or thick (wave propagation method). As designed by default"
+            help="optics of the judges: thin, or thick (wave propagation method). By default as designed"
         ),
     ] = None,
     stitch_field_um: Annotated[
         float,
-        typer.Option(help="side of the write fields that the judges' prints are made of, µm", hidden=True),
+        typer.Option(help="side of the write fields in the judges' prints, µm", hidden=True),
     ] = 100.0,
     stitch_sigma_um: Annotated[
         float,
-        typer.Option(help="sd along each axis by which each of them lies off its place, µm", hidden=True),
+        typer.Option(help="sd of the displacement of each write field along each axis, µm", hidden=True),
     ] = 0.0,
     stream: Annotated[
         bool,
@@ -188,15 +196,15 @@ def export(
     gds_layers: Annotated[
         Literal["cumulative", "exclusive"], typer.Option(help="layer k is level >= k, or level == k")
     ] = "cumulative",
-    gwl_mode: Annotated[Literal["galvo", "piezo"], typer.Option(help="who moves the focus")] = "galvo",
+    gwl_mode: Annotated[Literal["galvo", "piezo"], typer.Option(help="what moves the focus")] = "galvo",
     gwl_field_um: Annotated[float, typer.Option(help="write field of the galvo, µm")] = 100.0,
     gwl_speed: Annotated[float, typer.Option(help="scan speed, µm/s")] = 40000.0,
     gwl_power: Annotated[
-        str, typer.Option(help="laser power, %: one number, or that of the pedestal and of every level")
+        str, typer.Option(help="laser power, %: one number, or one for the pedestal and one per level")
     ] = "50",
     dose_curve: Annotated[
         Path | None,
-        typer.Option(help="CSV of grey,height_um as printed; without it grey is linear"),
+        typer.Option(help="CSV of grey,height_um as printed; without it, grey is linear in height"),
     ] = None,
     marks: Annotated[
         bool, typer.Option("--marks", help="also print an F (orientation) and a flat witness beside it")

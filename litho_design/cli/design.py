@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=DesignSettings)
 
-# A variant or a task among the changes replaces these.
+# A variant or a task in the changes replaces these.
 _hologram = partial(hologram_settings, "default")
 _lens = partial(lens_settings, "direct", "default")
 
@@ -49,8 +49,8 @@ Target = Annotated[str, typer.Option(help=f"wanted image: {_TARGET_HELP}")]
 SpreadOf = Annotated[
     Path | None,
     typer.Option(
-        help="dataset store: take the spread of gain and offset from its measured prints, the locked "
-        "scans left out",
+        help="dataset store: take the spread of gain and offset from its measured prints, without the "
+        "locked scans",
         hidden=True,
     ),
 ]
@@ -58,8 +58,8 @@ Judges = Annotated[
     list[str] | None,
     typer.Option(
         "--judge",
-        help="NAME=MODEL or MODEL that prints the finished layout; repeatable. Those of the zoo for the same "
-        "printer by default",
+        help="NAME=MODEL or MODEL that prints the finished layout; repeatable. By default the zoo's models "
+        "of the same printer",
     ),
 ]
 Robust = Annotated[
@@ -75,7 +75,7 @@ HeldOutObjects = Annotated[
     list[Path] | None,
     typer.Option(
         help="computational lens: picture or folder of pictures that is only scored; repeatable. By default "
-        "the last quarter of --objects by name, two at least",
+        "the last quarter of --objects by name, at least two",
         hidden=True,
     ),
 ]
@@ -86,7 +86,7 @@ def first(
     target: Target = "text",
     device: Device = "cpu",
 ) -> None:
-    """Design one small hologram with and without a printer's model, and show both printed: a minute.
+    """Design one small hologram with and without a printer's model, and show both prints; takes a minute.
 
     Example: litho-design first --target ring
     """
@@ -108,7 +108,7 @@ def hoe(
         bool,
         typer.Option(
             "--large",
-            help="in bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
+            help="work in bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
             "shares them among processes",
             hidden=True,
         ),
@@ -144,7 +144,7 @@ def correct(
     given: Given,
     after: Annotated[
         Path | None,
-        typer.Option(help="a first correction, printed and measured: what its print was off is taken off"),
+        typer.Option(help="a first correction, printed and measured: the error of its print is subtracted"),
     ] = None,
     scan: Scan = None,
     scan_unit: ScanUnit = None,
@@ -270,7 +270,7 @@ def _settings(
     task: str,
     spread_of: Path | None = None,
 ) -> S:
-    """The preset, then the settings file, the measured spreads and the command line, each over the last."""
+    """The preset, settings file, measured spreads and command line; each overrides those before it."""
     made = make(given.over(make({}), task))
     if spread_of is None:
         return made

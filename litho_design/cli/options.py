@@ -1,4 +1,4 @@
-"""Options made from the fields of the settings, so that a setting is stated in one place."""
+"""Options made from the fields of the settings, so that every setting is stated in one place."""
 
 from __future__ import annotations
 
@@ -41,18 +41,24 @@ BandPx = Annotated[
     ),
 ]
 Scan = Annotated[Path | None, typer.Option(help="AFM height map of the printed part")]
-ScanUnit = Annotated[str | None, typer.Option(help="unit of its heights, if the file has none", hidden=True)]
-ScanSizeUm = Annotated[float | None, typer.Option(help="its side, µm, if the file has none", hidden=True)]
+ScanUnit = Annotated[
+    str | None, typer.Option(help="unit of the scan's heights, if the file has none", hidden=True)
+]
+ScanSizeUm = Annotated[
+    float | None, typer.Option(help="side of the scan, µm, if the file has none", hidden=True)
+]
 ScanLevelling = Annotated[
     Literal["none", "plane", "bow"],
-    typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order", hidden=True),
+    typer.Option(
+        help="what is removed from the scan: nothing, a plane, or a bow of second order", hidden=True
+    ),
 ]
 ScanAligned = Annotated[
     bool,
     typer.Option(
         "--scan-aligned",
         hidden=True,
-        help="it lies on the pixels of the element, upright: for one that looks alike in several places",
+        help="the scan lies upright on the pixels of the element; for one that looks alike in several places",
     ),
 ]
 
@@ -64,7 +70,7 @@ def measured_source(
     levelling: Literal["none", "plane", "bow"],
     **further: Any,
 ) -> MeasuredSource | None:
-    """The measured print of the options of a scan, and further fields of it; None without a scan."""
+    """The measured print that the options of a scan describe, with further fields; None without a scan."""
     if scan is None:
         return None
     from litho_design.judging.measured import MeasuredSource
@@ -73,7 +79,7 @@ def measured_source(
 
 
 def numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
-    """The numbers behind an option, separated by commas."""
+    """The comma-separated numbers of an option."""
     try:
         return [kind(word) for word in words.split(",")]
     except ValueError:
@@ -102,7 +108,7 @@ class Given:
 
     Attributes:
         options: values by path, of options and of ``--set``.
-        names: how each of them was given, for messages.
+        names: how each value was given, for messages.
         config: settings file.
     """
 
@@ -111,14 +117,14 @@ class Given:
     config: Path | None
 
     def over(self, preset: BaseModel, task: str) -> dict[str, Any]:
-        """Values by path, those of the file first and those of the command line over them.
+        """Values by path, from the file, overridden by those of the command line.
 
         Args:
-            preset: settings that have the paths.
+            preset: settings that define the paths.
             task: what is designed, for messages.
 
         Raises:
-            InputError: an option of another task, or a file with an unknown name.
+            InputError: an option of another task, or an unknown name in the file.
         """
         known = {leaf.path for leaf in leaves(preset)}
         for path, name in self.names.items():
@@ -138,13 +144,13 @@ _FIRST = {
 def takes_settings(
     *presets: BaseModel, leave_out: Collection[str] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings that name one, ``--set`` and ``--config``.
+    """Give a command the options of all settings that define one, plus ``--set`` and ``--config``.
 
     The command takes them as its argument ``given``, a ``Given``.
 
     Args:
-        presets: settings, one record for each task; their values are shown as defaults.
-        leave_out: paths without an option here.
+        presets: settings, one record per task; the help shows their values as defaults.
+        leave_out: paths that get no option.
     """
     found: dict[str, list[Leaf]] = {}
     for leaf in (leaf for preset in presets for leaf in leaves(preset)):
@@ -177,7 +183,7 @@ def takes_settings(
 def as_toml(settings: BaseModel) -> str:
     """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
     lines: list[str] = []
-    # A table is written once, wherever its settings stand.
+    # Each table is written once, even if its settings are apart.
     tables: dict[str, list[Leaf]] = {"": []}
     for leaf in leaves(settings):
         tables.setdefault(leaf.path.rpartition(".")[0], []).append(leaf)
@@ -201,7 +207,7 @@ def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Paramet
     values = list(dict.fromkeys(_shown(one.value) for one in same))
     option = typer.Option(
         *leaf.options,
-        # In the style of the other options; in a file of settings it starts a line.
+        # Options begin in lower case; in a file of settings the text starts a line.
         help=described[:1].lower() + described[1:],
         show_default=" or ".join(values),
         rich_help_panel=leaf.group or None,

@@ -11,7 +11,7 @@ from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
 from litho_design.exports.formats import Format
 
-sheet = typer.Typer(help="One sheet of prints: for a lab, and back from it.", no_args_is_help=True)
+sheet = typer.Typer(help="One sheet of prints: make it for a lab, and read its scans.", no_args_is_help=True)
 
 
 @sheet.command("new")
@@ -20,10 +20,14 @@ def new(
     model: Annotated[
         str, typer.Option(help="folder of a frozen model, or zoo:NAME: one hologram is designed through it")
     ] = "zoo:pbl",
-    format: Annotated[Format, typer.Option(help="of the files for the printer, see docs/export.md")] = "stl",
+    format: Annotated[
+        Format, typer.Option(help="format of the files for the printer, see docs/export.md")
+    ] = "stl",
     target: Target = "text",
-    layouts: Annotated[int, typer.Option(min=6, help="random ones, to learn the printer from")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="of the random layouts")] = 0,
+    layouts: Annotated[
+        int, typer.Option(min=6, help="number of random layouts, to learn the printer from")
+    ] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random layouts")] = 0,
     device: Device = "cpu",
 ) -> None:
     """Write what a lab needs to print and scan one sheet; an interrupted run in OUT is continued.
@@ -44,7 +48,7 @@ def read(
     out: Out,
     device: Device = "cpu",
 ) -> None:
-    """Make of the scans a model of the printer, what it lacks, and a comparison of the two holograms.
+    """Turn the scans into a model of the printer, what it lacks, and a comparison of both holograms.
 
     Example: litho-design sheet read sheet --out answer
     """

@@ -1,4 +1,4 @@
-"""A printed element as a differentiable module: levels through the printer, its height through a resin."""
+"""A printed element as a differentiable module: from levels to printed heights to a wave behind the resin."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ class Element(nn.Module):
     """A printed element in a program of your own: ``element(field, wavelength_um)`` is the wave behind it.
 
     Its only trainable parameters are the free levels, one per cell or ring. They are rounded and kept within
-    the layout's levels with a straight-through gradient, printed by a frozen model with its guard ring, and
-    their height becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. So the wave is always
-    that of a layout that can be printed; ``whole = False`` leaves the levels real, for the first steps.
+    the layout's levels with a straight-through gradient. A frozen model prints them with its guard ring, and
+    the printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. So the wave
+    always belongs to a printable layout; ``whole = False`` leaves the levels real, for the first steps.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         layout: geometry and levels, or changes of the default ones, such as ``{"size_px": 256}``.
         resin: name of a resin, or a function from the wavelength in µm to its refractive index.
         surroundings: refractive index above the relief.
-        absorption_per_um: absorption of the resin, of the intensity, 1/µm.
+        absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
         kind: ``thin``, or ``thick`` for the wave propagation method through the relief, in air.
-        tile_px: elements larger than this are printed in tiles with their halo, which are computed again for
-            the gradient, so that memory grows with the tile and not with the element; None for one piece.
-        seed: of the random levels that it starts with.
+        tile_px: elements larger than this are printed in tiles with their halo. The gradient computes the
+            tiles again, so memory grows with the tile, not with the element; None prints in one piece.
+        seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
     Raises:
-        InputError: what ``load_printer`` refuses, a printer without gradients, a resin of no higher index
-            than what surrounds it, tiles of a model that depends on the position, or a thick element that is
-            not in air.
+        InputError: what ``load_printer`` refuses, a printer without gradients, a resin whose index is not
+            above that of the surroundings, tiles for a model that depends on the position, or a thick element
+            that is not in air.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Element(nn.Module):
         Args:
             field: the wave on the pixels of the layout, complex (..., size, size).
             wavelength_um: in vacuum.
-            height_um: a known print (size, size) instead of that of the levels, such as a measured one.
+            height_um: a known print (size, size), such as a measured one, instead of the print of the levels.
         """
         height = self.height_um() if height_um is None else height_um
         self._check_map("field", field)
@@ -116,7 +116,7 @@ class Element(nn.Module):
         return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
 
     def optics(self, wavelength_um: float) -> Optics:
-        """Wavelength, index step and kind of the element there."""
+        """Wavelength, index step and kind of the element at this wavelength."""
         if not SHORTEST_UM < wavelength_um < LONGEST_UM:
             wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
             hint = "are nm or metres meant? as_torchoptics(unit_um=1e6) counts in metres"
@@ -140,14 +140,14 @@ class Element(nn.Module):
         self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
 
     def as_torchoptics(self, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0) -> Any:
-        """The same element for ``torchoptics`` (extra ``torchoptics``): a ``PolychromaticModulationElement``.
+        """The same element as a ``PolychromaticModulationElement`` of torchoptics (extra ``torchoptics``).
 
         Args:
-            z, offset: place of the element, in the lengths of your program.
-            unit_um: one such length in µm: 1e6 where it counts in metres.
+            z, offset: position of the element, in your program's unit of length.
+            unit_um: that unit in µm; 1e6 for metres.
 
         Raises:
-            InputError: torchoptics is not installed, or a thick element, which no factor describes.
+            InputError: torchoptics is not installed, or a thick element, which is no complex factor.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement

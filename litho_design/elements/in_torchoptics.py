@@ -1,4 +1,4 @@
-"""A printed element among the elements of torchoptics; imported only where torchoptics is installed."""
+"""A printed element as an element of torchoptics; imported only if torchoptics is installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchoptics.utils import wavelength_or_default
 
 
 class PrintedElement(PolychromaticModulationElement):
-    """An ``Element`` on a plane of torchoptics: fields of its shape and spacing are modulated by it.
+    """An ``Element`` on a plane of torchoptics, which modulates fields of its shape and spacing.
 
     Args:
         element: the printed element, whose parameters become those of this module.
@@ -20,7 +20,7 @@ class PrintedElement(PolychromaticModulationElement):
 
     def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
         size, pitch = element.layout.size_px, element.layout.pitch_um
-        # Fields fit where their spacing is equal to the last bit: 0.1 / 1e6 is not 1e-7.
+        # Fields fit only if their spacing is equal to the last bit, and 0.1 / 1e6 is not 1e-7.
         super().__init__((size, size), z, float(f"{pitch / unit_um:.12g}"), offset)
         self.element, self.unit_um = element, unit_um
 

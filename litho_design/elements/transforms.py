@@ -1,4 +1,4 @@
-"""A print inside ``torch.func`` and ``torch.compile``, which cannot look into the models' own gradients."""
+"""A print inside ``torch.func`` and ``torch.compile``, which cannot trace the models' own gradients."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Print = Callable[[Tensor], Tensor]
 
 
 def printed_anyhow(run: Print, level: Tensor) -> Tensor:
-    """``run(level)``, as one step without an inside where a transform cannot look into it."""
+    """``run(level)``, as one opaque step if a transform cannot trace it."""
     if "torch._dynamo" in sys.modules:
         run = torch.compiler.disable(run)
     if not torch._C._functorch.is_functorch_wrapped_tensor(level):
@@ -21,12 +21,12 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
     try:
         return run(level)
     except RuntimeError:
-        # A gradient of the model's own, or a look at its values: no transform of torch.func takes them.
+        # The model defines a gradient of its own or inspects values, which torch.func does not allow.
         printed: Tensor = _Printed.apply(level, run)
         return printed
 
 
-# The mark of ``torch.compiler.disable``, whose import takes two seconds.
+# The mark that ``torch.compiler.disable`` sets; importing it would take two seconds.
 printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
 
 
@@ -59,7 +59,7 @@ class _Slope(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Second derivatives through a model are not known."""
+        """Save nothing: second derivatives through a model are not supported."""
 
     @staticmethod
     def vmap(

@@ -1,1 +1,1 @@
-"""Files for the printer, each with its sidecar, and the way back."""
+"""Files for the printer, each with its sidecar, and reading them back."""

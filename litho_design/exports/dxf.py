@@ -14,7 +14,7 @@ _BAND_PX = 128
 
 
 def write_dxf(path: Path, levels: LevelRows, pitch_um: float, greys: Sequence[int]) -> int:
-    """Write disjoint rectangles of every level whose grey is not 0, in µm, y up; returns how many."""
+    """Write disjoint rectangles of every level whose grey is not 0, in µm, y up; returns their number."""
     count = 0
     with open(path, "w", encoding="ascii") as stream:
         # $INSUNITS 13: micrometres.

@@ -1,4 +1,4 @@
-"""Export of a layout in one of the formats, and the exact import of what was exported."""
+"""Export of a layout in one of the formats, and exact import of exported files."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _SUFFIX: dict[str, str] = {
 }  # fmt: skip
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
-# What the other formats need of memory for it is some 3 GiB (images) and more (solids).
+# Beyond this size the other formats would need some 3 GiB of memory (images) or more (solids).
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
 
 @dataclass(frozen=True)
 class _Source:
-    """A layout to export: levels (ny, nx), their geometry and hash, and the design that they are of."""
+    """A layout to export: levels (ny, nx), their geometry and hash, and the design that they come from."""
 
     levels: LevelRows
     layout: LayoutSettings
@@ -76,17 +76,18 @@ def export(
     of rows at a time, so that memory does not grow with the height of an element.
 
     Args:
-        design: folder of a design, or what ``load_design`` gives; an ``Element``; or an array (ny, nx) or its
-            file NAME.npy: whole numbers are levels, others heights in µm, rounded to the nearest level.
+        design: a design, as its folder or from ``load_design``; an ``Element``; or an array (ny, nx) or its
+            file NAME.npy, whose whole numbers are levels, and other numbers heights in µm, rounded to the
+            nearest level.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; exports of the same layout in other formats stay in it.
-        pitch_um, level_height_um: pixel and level of an array; a design and an element have their own.
+        pitch_um, level_height_um: pixel and level of an array; designs and elements have their own.
         pedestal_um: base under level 0; printed by STL and GWL, a note to the operator in other formats.
-        slicing_um, hatching_um: settings of the print job: the sidecar has them, GWL uses them.
+        slicing_um, hatching_um: settings of the print job; the sidecar records them, GWL uses them.
         gwl: mode, write field, speed and power of GWL; ``Gwl()`` by default.
-        dose_curve: CSV of ``grey,height_um``, what the printer makes of a grey value, for the grey formats
-            bmp, png16 and dxf; without it grey is linear in height.
-        marks: also a mark of orientation and a flat witness beside the element (see ``with_marks``).
+        dose_curve: CSV of ``grey,height_um``, the printed height of each grey value, for the grey formats
+            bmp, png16 and dxf; without it, grey is linear in height.
+        marks: add a mark of orientation and a flat witness beside the element (see ``with_marks``).
 
     Returns:
         Path of the exported file.
@@ -152,14 +153,14 @@ def export(
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], written[rows]) for rows in bands_of(written, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
-        # The sidecar last: without it, or with an older one, the file is refused.
+        # The sidecar is written last, because a file without it, or with an older one, is refused.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
     return place / name
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """The level map of an element from its exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
+    """The level map of an element, uint8 (ny, nx), row 0 on top, and the sidecar, from an exported file.
 
     Raises:
         InputError: no sidecar, or a file that was changed.

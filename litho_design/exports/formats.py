@@ -1,4 +1,4 @@
-"""The formats that a design is exported in; a command line reads them without loading what writes them."""
+"""The formats of exports, apart from the code that writes them, so that the command line loads quickly."""
 
 from typing import Literal
 

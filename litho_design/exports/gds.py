@@ -28,22 +28,23 @@ def write_gds(
     layers: GdsLayers,
     parts: Mapping[str, Box] | None = None,
 ) -> int:
-    """Write rectangles, unit 1 µm, grid 1 nm, y up; returns how many the file holds.
+    """Write rectangles, unit 1 µm, grid 1 nm, y up; returns the number in the file.
 
     Layer k holds {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0).
-    Runs along rows are merged over equal rows below them, so every shape is a rectangle. The cell LAYOUT
-    refers to one cell for every part, that to one for every 128 rows, and that to blocks of 128 pixels:
-    equal blocks are one cell. Of the shapes no more than one block is in memory.
+    Runs along rows are merged with equal runs in the rows below, so every shape is a rectangle. The cell
+    LAYOUT refers to one cell per part, which refers to one cell per 128 rows, which refers to blocks of 128
+    pixels; equal blocks share a cell. Memory holds the shapes of one block at a time.
 
     Args:
-        parts: rows from, to, columns from, to, of each part by name; the whole map is ELEMENT by default.
+        parts: first and last row, first and last column of each part by name; by default the whole map is
+            ELEMENT.
     """
     import gdstk
 
     known: dict[bytes, gdstk.Cell] = {}
     height, width = levels.shape
     drawn, layout = 0, gdstk.Cell("LAYOUT")
-    # The same time for equal layouts, whose files are equal then.
+    # A fixed time, so that equal layouts give equal files.
     writer = gdstk.GdsWriter(path, unit=_UNIT_M, precision=_PRECISION_M, timestamp=datetime(1970, 1, 1))
     for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, width)}).items():
         part = gdstk.Cell(name)
@@ -57,7 +58,7 @@ def write_gds(
                     shapes = _shapes(block, pitch_um, layers)
                     drawn += len(shapes)
                     writer.write(gdstk.Cell(f"BLOCK_{len(known)}").add(*shapes))
-                    # Later blocks refer to it by its name: its shapes need not stay.
+                    # Later blocks refer to the cell by name, so its shapes need not stay in memory.
                     known[key] = gdstk.Cell(f"BLOCK_{len(known)}")
                 cell.add(gdstk.Reference(known[key], (column * pitch_um, 0)))
             writer.write(cell)
@@ -92,7 +93,7 @@ def rectangles(masks: np.ndarray) -> np.ndarray:
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)
     right = np.nonzero(edges < 0)[2]
-    # Equal runs of one mask, from above to below: a rectangle goes on while no row is left out.
+    # Equal runs of one mask, from top to bottom: a rectangle continues while no row is missing.
     order = np.lexsort([row, right, left, mask])
     mask, row, left, right = (one[order] for one in (mask, row, left, right))
     new = np.ones(len(row) + 1, bool)

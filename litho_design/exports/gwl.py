@@ -1,4 +1,4 @@
-"""Layouts as GWL for Nanoscribe printers: one line of resist per run of a row and slice, and back."""
+"""Layouts as GWL for Nanoscribe printers: one line of resist per run of pixels in a row and slice."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_design.exports.rows import LevelRows
 
-# What the piezo of a Photonic Professional reaches along x and y.
+# Range of the piezo of a Photonic Professional along x and y.
 _PIEZO_UM = 300.0
 
 
 class Gwl(Record):
     """How a Nanoscribe prints the slices."""
 
-    mode: Literal["galvo", "piezo"] = setting("galvo", "Who moves the focus: galvo or piezo")
+    mode: Literal["galvo", "piezo"] = setting("galvo", "What moves the focus: galvo or piezo")
     field_um: float = setting(100.0, "Side of a write field of the galvo", unit="µm", gt=0)
     speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", gt=0, le=1e7)
     power_percent: tuple[float, ...] = setting(
         (50.0,),
-        "Laser power, %: one number, or that of the pedestal and of every level above it",
+        "Laser power, %: one number, or one for the pedestal and one for every level above it",
     )
 
 
@@ -41,13 +41,14 @@ def write_gwl(
 ) -> int:
     """Write the slices from the pedestal up, field by field; returns the number of lines.
 
-    A slice of height z lies in the middle of its thickness, a row in the middle of its hatching distance, and
-    a line of resist runs along x from edge to edge of the pixels that are higher. x and y are those of the
-    element, y up, in galvo mode from the middle of the field, to which the stage moves.
+    A slice is written at the middle of its thickness, a row at the middle of its hatching distance, and a
+    line of resist runs along x from edge to edge of the pixels that reach the slice. x and y are those of the
+    element, y up; in galvo mode they count from the middle of the field, to which the stage moves.
 
     Raises:
-        InputError: level height or pedestal that are no whole number of slices, a pitch that is no whole
-            number of hatching distances, powers for another number of levels, or an element beyond the piezo.
+        InputError: a level height or pedestal that is not a whole number of slices, a pitch that is not a
+            whole number of hatching distances, powers for another number of levels, or an element beyond the
+            range of the piezo.
     """
     height, width = levels.shape
     thick, base, rows_per_px = (

@@ -1,4 +1,4 @@
-"""Layouts as grey images: grey linear in height, or as a dose curve says."""
+"""Layouts as grey images: grey is linear in height, or follows a dose curve."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from litho_design.printers.layout import LayoutSettings
 
 _UM_PER_CM = 1e4
 _STRIP_PX = 64
-# Offsets in a TIFF have 32 bits; beyond that, with room for its tags, it is a BigTIFF.
+# Offsets in a TIFF have 32 bits; a file beyond this size, with room for its tags, is a BigTIFF.
 _CLASSIC_BYTES = 2**32 - 2**24
 
 
@@ -32,13 +32,14 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(file: str | Path) -> Callable[[LayoutSettings, int], list[int]]:
-    """Greys whose heights a printer was measured to make are those of the levels, up to a constant height.
+    """Greys for which the printer's measured heights equal those of the levels, up to a constant height.
 
     Args:
         file: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
 
     Raises:
-        InputError: no such table; of the greys that it gives, a level beyond its heights, or two of one grey.
+        InputError: no such table; raised by the result: a level beyond the heights, or two levels of one
+            grey.
     """
     try:
         table = np.genfromtxt(file, delimiter=",", names=True, dtype=float)
@@ -66,7 +67,7 @@ def measured_greys(file: str | Path) -> Callable[[LayoutSettings, int], list[int
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
-    """A 16-bit grey PNG, or an 8-bit BMP and beside it a CSV of grey against height."""
+    """Write a 16-bit grey PNG, or an 8-bit BMP and beside it a CSV of grey and height."""
     import cv2
 
     kind = np.uint8 if path.suffix == ".bmp" else np.uint16
@@ -79,9 +80,9 @@ def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_heig
 
 
 def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float) -> None:
-    """A TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with its resolution.
+    """Write a TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with its resolution.
 
-    Written strip by strip; where a TIFF cannot hold them they are a BigTIFF, compressed by deflate.
+    It is written strip by strip; if a TIFF cannot hold the pages, as a BigTIFF compressed by deflate.
     """
     import tifffile
 

@@ -1,4 +1,4 @@
-"""What is printed beside an element: a mark that tells its orientation, and a flat witness of its height."""
+"""Prints beside an element: a mark that shows its orientation, and a flat witness of its height."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ Box = tuple[int, int, int, int]
 # An F looks different in all eight orientations.
 _LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 _STROKE_UM = 1.0
-# The middle of the witness is as wide as this, beyond the reach of its edges.
+# Width of the middle of the witness, out of reach of its edges.
 _FLAT_UM = 4.0
 
 
 class Marks(Record):
     """Where element, mark and witness lie in an exported map: rows from, to, columns from, to, in pixels.
 
-    ``witness_height_um`` is what the design model prints in its middle, above the ground around it.
+    ``witness_height_um`` is the height of the middle of the witness over the ground, as the design's model
+    prints it.
     """
 
     element_px: Box
@@ -42,18 +43,18 @@ def with_marks(
 ) -> tuple[SideBySide, Marks]:
     """The level map (size, size) with an F and a square of the highest level to the right of it.
 
-    Both keep the reach of the printer from the element and from each other, so that none changes the print of
-    another. Everything lies on whole cells.
+    Both are at least the printer's reach away from the element and from each other, so that none changes the
+    print of another. Everything lies on whole cells.
 
     Args:
         guard_um: reach of the printer, µm.
         level_heights_um: printed height of wide fields of each level.
 
     Returns:
-        Levels uint8 (size, wider), and where what lies.
+        Levels uint8 (size, wider), and the positions of the parts.
 
     Raises:
-        InputError: an element that is lower than mark and witness together.
+        InputError: an element with less height in the map than mark and witness together.
     """
     cell = 1 if layout.symmetry == "radial" else layout.cell_px
 

@@ -13,7 +13,7 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx), row 0 on top, whose rows are cut out as those of an array; it may be on disk."""
+    """A level map (ny, nx), row 0 on top, in memory or on disk, whose rows are sliced like an array's."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -25,10 +25,10 @@ class LevelRows(Protocol):
 
 @dataclass(frozen=True)
 class RingRows:
-    """The plane of a lens of rings, of which no more is made than the rows that are asked for.
+    """The plane of a lens of rings; only the requested rows are made.
 
     Args:
-        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture take the last.
+        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture take the last level.
     """
 
     ring_level: np.ndarray

@@ -17,12 +17,12 @@ from litho_design.printers.printer import PrinterRecord
 from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.design import Design
 
-# What a sidecar takes over from the record of its design.
+# Fields that a sidecar copies from the record of its design.
 _OF_DESIGN = ("printer", "stroke", "printability", "out_of_distribution", "predicted", "settings")
 
 
 class Sidecar(Result):
-    """<file>.json beside an exported file; bare levels and heights lack what a design knows."""
+    """<file>.json beside an exported file; without a design, the design's own fields are missing."""
 
     SCHEMA: ClassVar[str] = "litho-design/export/2"
     FILE_NAME: ClassVar[str] = "export.json"
@@ -31,7 +31,7 @@ class Sidecar(Result):
     file_sha256: str
     format: Format
     layout_sha256: str
-    # Of the whole file, marks included.
+    # Shape of the whole file, including marks.
     shape_px: tuple[int, int]
     pitch_um: float
     cell_px: int
@@ -43,7 +43,8 @@ class Sidecar(Result):
     pedestal_um: float
     slicing_um: float
     hatching_um: float
-    # Of every level, in grey formats; ``white_height_um`` is the height of the highest value of a linear one.
+    # Grey of every level in grey formats; ``white_height_um`` is the height of the highest grey if grey is
+    # linear.
     greys: list[int] | None
     white_height_um: float | None
     gds_layers: Literal["cumulative", "exclusive"] | None
@@ -66,7 +67,7 @@ class Sidecar(Result):
 
 
 def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, Any]:
-    """Fields of the sidecar of a map of this shape."""
+    """Fields of the sidecar for a map of this shape."""
     return {
         "shape_px": shape_px,
         "pitch_um": layout.pitch_um,
@@ -86,7 +87,7 @@ def of_design(folder: Path, design: Design) -> dict[str, Any]:
 
 
 def sidecar_path(file: Path) -> Path:
-    """Where the sidecar of a file lies."""
+    """Path of the sidecar of a file."""
     return file.with_name(file.name + ".json")
 
 

@@ -1,4 +1,4 @@
-"""Layouts as a closed solid (binary STL, µm): two triangles a top; walls meet corner to corner."""
+"""Layouts as a closed solid (binary STL, µm): two triangles per top; walls meet corner to corner."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from litho_data.foundation.errors import InputError
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER_BYTES = 80
-# Where columns touch along an edge only, the higher one keeps this share of a cell away from it.
+# If columns touch only along an edge, the higher one is moved away from it by this share of a cell.
 _APART = 1 / 128
-# Ways (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
+# Directions (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
 _WAY = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)], np.float32)
 _BELOW = -1
 
@@ -22,7 +22,7 @@ def write_stl(
 ) -> int:
     """Write the surface ``pedestal_um + level * level_height_um``; returns the number of triangles.
 
-    Every edge has two faces, also where columns touch along an edge only, see ``step_solid``.
+    Every edge has two faces, even where columns touch only along an edge; see ``step_solid``.
 
     Args:
         levels: integer levels per cell (ny, nx), row 0 on top; y grows up in the file.
@@ -52,8 +52,8 @@ def write_stl(
 def step_solid(levels: np.ndarray) -> np.ndarray:
     """Triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
 
-    Every edge has two faces, which meet it in opposite directions: a wall has a corner wherever one of the
-    four columns around its ends has its top.
+    Every edge has two faces, which traverse it in opposite directions: a wall has a corner at the height of
+    each top among the four columns around its ends.
 
     Args:
         levels: integers (ny, nx) of 0 or more; y grows with the row.
@@ -82,7 +82,7 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Places (n, 3) over points (n, 2), row and column, of which some are moved towards a cell."""
+    """Positions (n, 3) at points (n, 2), row and column; some are moved towards a cell."""
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)
 
@@ -91,7 +91,7 @@ def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
     """Two triangles for each cell."""
     cell = np.argwhere(around[:-1, :-1, 3] >= 0)
     z = around[cell[:, 0], cell[:, 1], 3]
-    # Of the cell its point in the south-west, where the cell itself lies north-east, and so on around.
+    # The cell's south-west point, from which the cell lies north-east, and so on around the cell.
     corners = []
     for step, way in (((0, 0), 3), ((0, 1), 2), ((1, 1), 0), ((1, 0), 1)):
         point = cell + step
@@ -106,14 +106,14 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     south, north = cells[row, column + 1], cells[row + 1, column + 1]
     low, high = np.minimum(south, north), np.maximum(south, north)
     ends = []
-    # The higher cell, seen from the end in the west and from that in the east.
+    # Direction of the higher cell from the western and from the eastern end.
     for point, place in (
         (np.stack([row, column], 1), np.where(north > south, 3, 1)),
         (np.stack([row, column + 1], 1), np.where(north > south, 2, 0)),
     ):
         at = (point[:, 0], point[:, 1])
         moved, levels = aside[*at, place], around[at].copy()
-        # The edge of a moved column passes the column that it was moved from.
+        # The edge of a moved column passes by the column from which it was moved away.
         opposite = np.arange(len(row)), 3 - place
         levels[opposite] = np.where(moved, low, levels[opposite])
         chain = np.sort(levels.clip(low[:, None], high[:, None]), axis=1)

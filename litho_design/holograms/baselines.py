@@ -1,4 +1,4 @@
-"""What a hologram's scores have to be compared with, on the same grid: nothing at all, and ideal elements."""
+"""Scores to compare a hologram's with, on the same grid: of a black image, and of ideal elements."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_design.optimisation.phases import gerchberg_saxton
 _ITERATIONS = 40
 _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
-# Figures that make sense for any image, whatever made it.
+# Figures that make sense for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
 
 
@@ -28,9 +28,9 @@ def hologram_baselines(
     """Scores of a black image, and of ideal elements in the optics of ``bench``, by name.
 
     ``diffraction-limited``: an element of free amplitude and phase, with a flat phase in the image, found by
-    forty Gerchberg-Saxton steps. ``continuous phase``: one phase per cell, no printer and no levels, from a
-    Gerchberg-Saxton start by a hundred steps down the design's own loss, which is stated. ``weighted GS``:
-    forty weighted Gerchberg-Saxton steps on the same phases.
+    forty Gerchberg-Saxton steps. ``continuous phase``: one phase per cell, without printer and levels, from a
+    Gerchberg-Saxton start and a hundred steps down the design's own loss, which is among the scores.
+    ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -54,10 +54,10 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Power on the signal {T > 0.5} of the best phase found from a print (size, size), power alone counting.
+    """Power on the signal {T > 0.5} of the phase of most power that is found from a print (size, size).
 
-    u <- exp(j arg P^H S P u), with S the signal: the share never falls from step to step, because P^H S P is
-    positive; so the result is never below the print's own. One phase per pixel.
+    u <- exp(j arg P^H S P u), with S the signal and one phase per pixel: because P^H S P is positive, no step
+    lowers the share, so the result is never below the print's own.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)
@@ -89,7 +89,7 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
     return wave / (wave.abs().square().sum() * area).sqrt()
 
 
-# A search of its own, whoever asks: scores are mostly taken without gradients.
+# This search needs gradients, even if the caller disabled them, as scores mostly do.
 @torch.enable_grad()
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None

@@ -47,10 +47,10 @@ class HologramBench(ElementBench):
 class HologramScore(Record):
     """Efficiencies are shares of the power incident on the element."""
 
-    eff_signal: float = Field(description="power on the signal (T > 0.5), share of incident")
-    eff_paper: float = Field(description="power where T > 0, share of incident")
-    eff_window: float = Field(description="power in the window, share of incident")
-    zero_order_share: float = Field(description="zero order, share of incident")
+    eff_signal: float = Field(description="power on the signal (T > 0.5), share of the incident power")
+    eff_paper: float = Field(description="power where T > 0, share of the incident power")
+    eff_window: float = Field(description="power in the window, share of the incident power")
+    zero_order_share: float = Field(description="zero order, share of the incident power")
     si_psnr_db: float = Field(description="scale-invariant PSNR, dB")
     rmse_paper: float = Field(description="RMSE at the paper's scale")
     ssim: float = Field(description="SSIM")
@@ -66,7 +66,7 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """With a signal window, beyond which light is free: the figures above count that light as an error."""
+    """With a signal window: light beyond it is free, but the other figures count it as an error."""
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
 
@@ -74,7 +74,7 @@ class WindowedHologramScore(HologramScore):
 def hologram_score(
     waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics
 ) -> HologramScore:
-    """Score the waves in the image plane, whose intensities add up, against the wanted image.
+    """Score the sum of the intensities of the waves in the image plane against the wanted image.
 
     S = {T > 0.5}; scale before comparison c = sum(I T) / sum(I^2); SSIM with an 11 px Gaussian
     window, sigma 1.5, data range 1, on c I clipped to [0, 1].
@@ -102,23 +102,23 @@ def hologram_score(
 
 
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
-    """A target (m, m) as finely as an element of the same size can draw it, real (m, m).
+    """A target (m, m) at the resolution of an element of the same size, real (m, m).
 
-    It is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes, with the
-    NA from the axis to the edge; dark beyond the window.
+    It is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes, with the NA
+    from the axis to the edge, and is dark beyond the window.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
         aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
-        # Row i holds what pixel i sees of every other: two products of matrices instead of long convolutions.
+        # Row i holds the weights of all pixels in pixel i: two matrix products instead of long convolutions.
         blurs.append((focus / focus.sum()).unfold(0, count, 1).flip(1))
     return blurs[0] @ target @ blurs[1].T
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Share of the power behind the element that is its mean: the undiffracted plane wave."""
+    """Share of the power behind the element that is in its mean, the undiffracted plane wave."""
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)
 
@@ -129,7 +129,7 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """SSIM of the light of some waves as a camera records it, against the target on its pixels."""
+    """SSIM of the light of the waves as a camera records it, against the target on the camera's pixels."""
     import cv2
 
     seen = _added(

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 class HologramLoss(Record):
     """RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
-    With ``signal_window_um`` only pixels that close to the wanted light count in the error; beyond them light
-    is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008, doi:10.1364/OE.16.002176).
-    ``scale`` matches the image to the target: ``paper`` divides by the mean over the wanted light,
-    ``least-squares`` uses the factor of least error. The efficiency is
-    the share of the incident power on pixels whose target is above zero.
+    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; beyond
+    them, light is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
+    doi:10.1364/OE.16.002176). ``scale`` matches the image to the target: ``paper`` divides by the mean over
+    the wanted light, ``least-squares`` uses the factor of least error. The efficiency is the share of the
+    incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
@@ -38,7 +38,7 @@ class HologramLoss(Record):
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Pixels (size, size) that count in the error: those near the wanted light; None for all."""
+    """Pixels (size, size) near the wanted light, which count in the error; None for all."""
     if not settings.signal_window_um:
         return None
     import torch
@@ -61,9 +61,10 @@ def hologram_loss(
         share: share of the incident power on each pixel (size, size).
         target: wanted intensity in [0, 1], (size, size).
         counted: pixels that count in the error, bool (size, size); None for all.
-        total: sum over the pixels of the image, of which the others may be a part; None where they are all.
+        total: sums over the pixels of the whole image, if the other arguments are a part of it; otherwise
+            None.
     """
-    import torch  # the command line reads the weights without it
+    import torch  # imported late, because the command line reads the weights without it
 
     total = total or torch.sum
     efficiency = total(share[target > 0])

@@ -1,4 +1,4 @@
-"""All settings of a hologram, by preset: choices that the paper leaves open are stated here."""
+"""All settings of a hologram, by preset, including the choices that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def hologram_settings(
 
     ``paper``: as printed (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
-    temperature 1, a tenth of the rate after more than ten iterations without progress, wavelength 0.633
-    and index step 0.545; its efficiency term is constant and therefore left out). What is not reproduced
-    of that code is in docs/from_the_authors_code.md. ``default``: one height per cell from a Gerchberg-Saxton
+    temperature 1, a tenth of the rate after more than ten iterations without progress, wavelength 0.633 and
+    index step 0.545; its efficiency term is constant and therefore left out). For what is not reproduced of
+    that code, see docs/from_the_authors_code.md. ``default``: one height per cell from a Gerchberg-Saxton
     start, and a polish of the printable layout.
 
     Args:
-        variant: the preset; ``variant`` among the changes replaces it.
+        variant: the preset; a ``variant`` in the changes replaces it.
         changes: values by dotted path, or nested as in a settings file.
 
     Raises:

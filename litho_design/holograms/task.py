@@ -1,4 +1,4 @@
-"""The hologram as a task: from levels on the pixels to a loss, a score and what is kept."""
+"""The hologram as a task: from levels on the pixels to a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class HologramTask(Task):
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
         printer: frozen model, or nominal heights.
-        inputs: ``target``, the wanted image of the size of the element, as ``load_target`` gives it with its
+        inputs: ``target``, the wanted image of the size of the element, as ``load_target`` gives it, with its
             record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
-        InputError: a target of another size or without dark and bright pixels, a start for lenses, or
+        InputError: a target of another size or without dark and bright pixels, a start that is for lenses, or
             spreads beyond the range of the propagator.
     """
 
@@ -49,7 +49,7 @@ class HologramTask(Task):
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
-    # Sum over the pixels of the whole element, of which target and cells may be a part.
+    # Sums over the pixels of the whole element, of which target and cells may be a part.
     total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
@@ -72,7 +72,7 @@ class HologramTask(Task):
         self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
 
     def make_bench(self, optics: Optics) -> HologramBench:
-        """Light onto the image plane."""
+        """The bench from the element to the image plane."""
         return HologramBench(self.settings.layout, optics).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
@@ -113,7 +113,7 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Signal efficiency of the best continuous phase found from the print, power alone counting."""
+        """Signal efficiency of the continuous phase of most power that is found from the print."""
         return best_signal_efficiency(self.bench, height_um, self.target)
 
     def baselines(self) -> dict[str, dict[str, float]]:
@@ -127,14 +127,14 @@ class HologramTask(Task):
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
-    """A note where diffraction blurs the strokes of the target, whatever the layout is."""
+    """A note if diffraction blurs the strokes of the target, whatever the layout."""
     layout, optics = settings.layout, settings.optics
     stroke_um = stroke_width_px(target) * layout.pitch_um
     finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
     if stroke_um >= finest_um:
         return []
     near_um = stroke_um / finest_um * optics.distance_um
-    # Two digits, rounded down: at the distance that is advised nothing is too fine.
+    # Two digits, rounded down, so that nothing is too fine at the advised distance.
     digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
     near_um = math.floor(near_um / digit_um) * digit_um
     return [

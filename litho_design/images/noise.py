@@ -1,4 +1,4 @@
-"""White noise of a measured map, and how far a score moves within what a measurement allows."""
+"""White noise of a measured map, and the change of a score within the uncertainty of a measurement."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Draws of a measurement's own uncertainty: their rms is known to 25 %.
+# Number of draws from a measurement's uncertainty, which gives their rms to 25 %.
 DRAWS = 8
-# Frequencies along both axes, cycles/px, beyond which neither prints nor images have structure left.
+# Beyond this frequency along both axes, cycles/px, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
 
@@ -26,9 +26,10 @@ def white_noise(values: np.ndarray) -> float:
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Noise of a photograph (ny, nx): sd in the dark, and as a share of the light, such as of speckle.
+    """Noise of a photograph (ny, nx): sd in the dark, and sd as a share of the light, as of speckle.
 
-    The variance of its highest frequencies is a sum of both squares, as far as it follows that of the light.
+    The variance of the highest frequencies is fitted as the square of the first plus that of the second times
+    the light.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -42,7 +43,7 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
 
 
 def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Hann window of a map, and which of its frequencies hold noise only."""
+    """Hann window of a map, and the mask of its frequencies that hold only noise."""
     along = [np.abs(np.fft.fftfreq(count)) > _NOISE_BAND for count in shape]
     return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
@@ -55,11 +56,12 @@ def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iter
 def freed_of_noise(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Figures without what noise adds to them on average, and the standard deviation of each.
+    """Figures without the bias from noise, and the standard deviation of each.
 
-    What the noise of the variants adds to a measurement that has as much already is taken for what that has
-    added to the truth (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Variants come
-    in pairs of opposite noise, so that it adds nothing to a figure that is linear in it.
+    The measurement already contains noise, and the variants add as much again; their mean change estimates
+    the change that the measurement's own noise caused (bias correction by bootstrap, Efron and Tibshirani
+    1993, chapter 10). Variants come in pairs of opposite noise, so a figure that is linear in the noise is
+    not changed.
     """
     changes = dict(_changes(score, measured, variants))
     figures = {name: getattr(measured, name) - float(found.mean()) for name, found in changes.items()}
@@ -69,7 +71,7 @@ def freed_of_noise(
 def _changes(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Of every figure of ``measured`` its changes over variants of the measurement."""
+    """The changes of every figure of ``measured`` over variants of the measurement."""
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
     for name, value in measured.model_dump(exclude_none=True).items():
         yield name, np.array([one[name] for one in scores]) - value

@@ -1,4 +1,4 @@
-"""Photographs: cleaned, and registered on the image that a design expects."""
+"""Photographs, cleaned and registered on the image that a design expects."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
-# Of pixels at the end of their range: more of them change the likeness of an image.
+# Largest share of pixels at an end of their range; more would change the similarity of an image.
 _LARGEST_SATURATED = 0.01
-# Prints close to the expected one look as if the exponent of counts over light were 0.9 to 1.1.
+# Prints close to the expected one give apparent exponents of counts over light of 0.9 to 1.1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
-# Loss of light in the corners that an objective may have.
+# Sd of the loss of light that an objective may have in the corners.
 _VIGNETTING_SD = 0.1
-# A tilt is accepted if it leaves no more than this share of what is unexplained without it.
+# A tilt is accepted if the unexplained variance falls below this share of that without a tilt.
 _NEEDED = 0.93
-# Half the range of tilts that a camera is believed to have, over half the window.
+# Sd of the plausible tilts of a camera, over half the window.
 _TILT_SD = 0.1
-# Along each side of the window.
+# Number of tiles along each side of the window.
 _TILES = 6
-# Orientations are told apart on images of about this side, px; correlations this close are a tie.
+# Orientations are compared on images of about this side, px; correlations this close are a tie.
 _SMALL_PX = 192
 _TIE = 0.03
 
@@ -41,10 +41,10 @@ _TIE = 0.03
 class CameraRecord(Record):
     """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens.
 
-    ``orientation`` is the operation that brings the photograph onto the image, ``ambiguous`` lists others
-    that fit as well. ``noise_counts`` is the noise (sd) in the dark, ``noise_share`` what it grows by, as a
-    share of the light; ``vignetting_sd`` what the camera may lose in its corners; ``blur_um`` the blur (sd)
-    beyond the expected image, and ``gamma`` the exponent of counts over light, as found.
+    ``orientation`` is the operation that brings the photograph onto the image; ``ambiguous`` lists others
+    that fit as well. ``noise_counts`` is the noise (sd) in the dark and ``noise_share`` the further noise as
+    a share of the light; ``vignetting_sd`` is the possible loss in the camera's corners; ``blur_um`` is the
+    fitted blur (sd) beyond the expected image and ``gamma`` the fitted exponent of counts over light.
     """
 
     name: str
@@ -71,7 +71,7 @@ class CameraRecord(Record):
     notes: list[str]
 
     def remarks(self) -> list[str]:
-        """What to know about the photograph, one phrase each."""
+        """Remarks about the photograph, one phrase each."""
         found = list(self.notes)
         if self.orientation != "identity":
             found.append(f"the photograph was brought onto the image by {self.orientation}, as asked")
@@ -79,9 +79,13 @@ class CameraRecord(Record):
             others = ", ".join(self.ambiguous)
             found.append(f"ambiguous: it fits as well after {others}, so a mirrored print would go unnoticed")
         if self.coverage < 1:
-            found.append(f"{100 * (1 - self.coverage):.1f} % of the image lies beyond it, and is as expected")
+            found.append(
+                f"{100 * (1 - self.coverage):.1f} % of the image lies beyond it, and is taken as expected"
+            )
         if self.vignetting_sd:
-            found.append("without --camera-flat a vignetting may be in the score, and is in its uncertainty")
+            found.append(
+                "without --camera-flat the score may contain vignetting; its uncertainty includes that"
+            )
         if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
             found.append(f"counts look like the light to the power {self.gamma:.2f}: is the file raw?")
         return found
@@ -93,11 +97,11 @@ class PhotoSource:
 
     Attributes:
         imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
-        orientation: the operation that brings it upright, where the camera turned or mirrored it.
+        orientation: the operation that makes it upright, if the camera turned or mirrored it.
         power_counts: summed counts, without dark level, of all light that falls on the element, at the same
-            exposure; without it a photograph knows no efficiency.
-        pitch_sd: relative standard uncertainty of the pitch, where the magnification is not sure.
-        flat: photograph of an even light by the same camera; with it a vignetting is none.
+            exposure; needed for efficiencies.
+        pitch_sd: relative standard uncertainty of the pitch, if the magnification is uncertain.
+        flat: photograph of uniform light by the same camera, which removes vignetting.
     """
 
     path: Path
@@ -112,16 +116,16 @@ class PhotoSource:
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph and where the image lies on it.
+    """A photograph and the position of the image on it.
 
     Attributes:
-        counts: cleaned, upright, without the dark level (ny, nx).
+        counts: cleaned, upright counts without the dark level (ny, nx).
         window_to_photo: projective map (3, 3) from window pixels to its pixels.
         side_px: side of the window.
         pitch_um: pixel of the window.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
-        expected: counts (m, m) that stand for what lies beyond the photograph.
+        expected: counts (m, m) that replace what lies beyond the photograph.
     """
 
     counts: np.ndarray
@@ -133,17 +137,17 @@ class Photograph:
     expected: np.ndarray
 
     def image(self) -> np.ndarray:
-        """Counts per pixel of the photograph, on the pixels of the window (m, m); noise goes below 0."""
+        """Counts per pixel of the photograph, on the window (m, m); noise may make them negative."""
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
-        """``image`` as the share of the light that falls on the element, of its summed counts."""
-        # Pixels of the photograph to a pixel in the middle of the window.
+        """``image`` as shares of the light on the element, from the summed counts of that light."""
+        # Pixels of the photograph per pixel in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Images that it would also allow: other noise, dark level, place, size and vignetting, in pairs."""
+        """Images that are as plausible: other noise, dark level, position, size and vignetting, in pairs."""
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
         sd = np.sqrt(record.noise_counts**2 + (record.noise_share * light) ** 2)
@@ -170,7 +174,8 @@ class Photograph:
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
-        # What is finer than any light of the element is noise; of the rest a pixel took its mean.
+        # Detail finer than any light of the element is noise; the rest is corrected for the mean over a
+        # pixel.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
         sharp = (frequency <= self.finest_per_um) / np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
         kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(sharp, sharp), norm="ortho")
@@ -182,21 +187,22 @@ def photographed_image(
 ) -> Photograph:
     """A photograph, registered on the image that the design expects.
 
-    Dark level subtracted, single hot or dead pixels replaced by their neighbours' median, then brought onto
-    the expected image as a camera sees it that is moved and turned, and tilted if that is needed: by least
-    squares, with gain and background free. The scale is that of the pitch, unless the pitch has an
-    uncertainty: a print that is too large is not the camera's fault. All eight orientations are tried, and a
-    photograph that fits another one better than ``orientation`` is refused.
+    The dark level is subtracted, and single hot or dead pixels are replaced by their neighbours' median. Then
+    the photograph is fitted to the expected image, as seen by a camera that is moved, turned and, if needed,
+    tilted: by least squares, with gain and background free. The scale follows from the pitch, unless the
+    pitch has an uncertainty, because a print that is too large is not the camera's fault. All eight
+    orientations are tried, and a photograph that fits another orientation better than ``orientation`` is
+    refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
-        source: grey image of any bit depth, counts proportional to the light. Without its dark level, that is
-            what makes the darkest pixels as bright as expected.
-        finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; what is finer is left out.
+        source: grey image of any bit depth, counts proportional to the light. If the dark level is unknown,
+            it is chosen so that the darkest pixels are as bright as expected.
+        finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
 
     Raises:
         InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
-            is overexposed, not linear, unlike the expected image, or mirrored or turned.
+            is overexposed, not linear, unlike the expected image, mirrored or turned.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -228,7 +234,7 @@ def photographed_image(
         got = f"{100 * coverage:.0f} % of the image"
         wanted_share = f"at least {100 * _SMALLEST_COVERAGE:.0f} %"
         raise InputError(f"photograph {photo_file}", got=got, wanted=wanted_share)
-    # A print unlike the expected one has bright and dark elsewhere, and that looks like a gamma, too.
+    # A print unlike the expected one is bright and dark in other places, which looks like a gamma, too.
     open_gamma = _LARGEST_GAMMA_OFF + 2 * (1 - fit.correlation)
     if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
         raise InputError(
@@ -271,17 +277,18 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Share of pixels at the top of the range: of the file, or of 12 or 14 bits in it where they pile up."""
+    """Share of pixels at the top of the range: of the file, or of 12 or 14 bits if counts pile up there."""
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
     at_top = float((raw == top).mean())
-    # A maximum that many pixels share, and few come close to, is an end of the range whatever its number.
+    # A maximum that many pixels share and few others come close to is an end of the range, whatever its
+    # value.
     beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
     return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
 
 
 def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | None) -> np.ndarray:
-    """A photograph over the brightness of an even light, 1 in its mean; its dark level stays."""
+    """A photograph divided by the brightness of uniform light, whose mean is 1; its dark level stays."""
     from scipy.ndimage import gaussian_filter
 
     flat = read_grey(flat_file, "photograph of an even light")[0].astype(np.float32)
@@ -294,7 +301,7 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
 
 
 def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
-    """What makes the darkest pixels of the photograph as bright as those expected, and its sd."""
+    """The dark level that makes the darkest pixels of the photograph as bright as expected, and its sd."""
     import cv2
 
     way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
@@ -319,7 +326,7 @@ def _check_orientation(
     shrink = max(1, wanted.shape[0] // _SMALL_PX)
     side = wanted.shape[0] // shrink
     small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
-    # The camera is brought to the same pixels, or its noise would decide.
+    # The photograph is brought to the same pixels; otherwise its noise would decide.
     finer = max(1, round(wanted.shape[0] / side / scale))
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]
@@ -336,7 +343,7 @@ def _check_orientation(
             got=f"an image that fits after {best} (correlation {found[best]:.2f}), not after {asked} "
             f"({found[asked]:.2f})",
             wanted="an upright photograph",
-            hint=f"if the camera and not the print did that: --camera-orientation {best}",
+            hint=f"if the camera, not the print, caused that: --camera-orientation {best}",
         )
     return [name for name in found if name != asked and found[name] > found[asked] - _TIE]
 
@@ -346,19 +353,19 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
         f"photograph {photo_file}",
         got=f"correlation {correlation:.2f} with the expected image in any orientation",
         wanted=f"at least {_SMALLEST_CORRELATION}",
-        hint="check the camera pitch; --camera-pitch-sd where it is not sure",
+        hint="check the camera pitch; give --camera-pitch-sd if it is uncertain",
     )
 
 
 def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
-    """Pixels far from the median of their 3 x 3 neighbourhood, in units of the image's own spread."""
+    """Replace pixels far from the median of their 3 x 3 neighbourhood, in units of the image's own spread."""
     import cv2
 
     lit = photo - np.percentile(photo, 1)
     median = cv2.medianBlur(lit.astype(np.float32), 3)
     difference = lit - median
     spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
-    # A hot pixel does not decide what is bright.
+    # So that no hot pixel decides what is bright.
     bright = float(median.max())
     outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
     return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())
@@ -366,7 +373,7 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Map (3, 3) from window to photograph pixels, what the camera does, and standard deviations."""
+    """Map (3, 3) from window to photograph pixels, the camera's properties, and standard deviations."""
 
     window_to_photo: np.ndarray
     correlation: float
@@ -379,7 +386,7 @@ class _Fit:
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
-    """The camera whose photograph of the expected image is closest; ``further``: what else it does."""
+    """The camera whose photograph of the expected image is closest; ``further``: fit tilt and light too."""
     import cv2
 
     side, blur_px = wanted.shape[0], 2 * max(1.0, scale)
@@ -397,9 +404,9 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
     pose[:2] = _shift_px(fixed, seen(smooth, pose))
     free = [0, 1, 2] + ([3] if pitch_sd else [])
-    # Sines of angles, logarithm of the scale and tilts move the edge by as much as a shift of half a window.
+    # A unit of angle (sine), log scale or tilt moves the edge as much as a shift of half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
-    # Residuals of neighbours are the same one: this many pixels count as one.
+    # Residuals of neighbours are not independent: this many pixels count as one.
     alike = 4 * math.pi * blur_px**2
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -410,13 +417,13 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             at[columns] += step * unit[columns]
             one = seen(image, at)
             off = (one - one.mean()) / max(float(one.std()), 1e-12) - target
-            # What is known beforehand of scale and tilts.
+            # Prior knowledge of scale and tilts.
             prior = [at[3] / pitch_sd] if 3 in columns and pitch_sd else []
             prior += [at[i] / _TILT_SD for i in (4, 5) if i in columns]
             return np.append(off.ravel() / math.sqrt(alike), prior)
 
         def slopes(step: np.ndarray) -> np.ndarray:
-            # Half a pixel: cv2 knows places to a 32nd of one.
+            # Steps of half a pixel, because cv2 resolves positions only to 1/32 of a pixel.
             ways = 0.5 * np.eye(len(columns))
             return np.stack([residual(step + way) - residual(step - way) for way in ways], axis=1)
 
@@ -425,7 +432,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         at[columns] += found.x * unit[columns]
         return at, found
 
-    # From coarse to fine: the fine structure of an image has maxima beside the right one.
+    # From coarse to fine, because the fine structure of an image has maxima beside the right one.
     for more in (4 * blur_px, 0.0):
         images = smooth, fixed
         if more:
@@ -453,9 +460,9 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
 
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
-    """Covariance of what least squares found, where neighbours are alike: by the scatter between tiles.
+    """Covariance of a least-squares fit with correlated neighbours, from the scatter between tiles.
 
-    A print unlike the expected one is displaced here one way and there another (White 1980; a tile is one
+    A print unlike the expected one is displaced differently from place to place (White 1980; one tile is one
     observation).
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
@@ -468,7 +475,7 @@ def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarr
 
 
 def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:
-    """Counts as background + gain * (blurred expected light)^gamma, by least squares."""
+    """Fit counts as background + gain * (blurred expected light)^gamma, by least squares."""
     import cv2
 
     found = {}
@@ -500,7 +507,7 @@ def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -
 
 
 def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
-    """Which pixels of the window (side, side) lie on the photograph."""
+    """The pixels of the window (side, side) that lie on the photograph."""
     y, x = np.mgrid[:side, :side].astype(float)
     at_x, at_y, w = np.tensordot(warp, np.stack([x, y, np.ones_like(x)]), 1)
     return (np.abs(2 * at_x / w - shape[1] + 1) < shape[1]) & (np.abs(2 * at_y / w - shape[0] + 1) < shape[0])
@@ -513,7 +520,7 @@ def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Whole pixels (x, y) by which ``moving`` (n, n) has to be read later: the maximum of the correlation."""
+    """Shift (x, y) of ``moving`` (n, n) in whole pixels, by the maximum of the correlation."""
     n = len(reference)
     spectra = [np.fft.rfft2(image - image.mean(), s=(2 * n, 2 * n)) for image in (moving, reference)]
     correlation = np.fft.irfft2(spectra[0] * spectra[1].conj())

@@ -77,7 +77,7 @@ def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
 
 
 def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
-    """Where the light of an image (m, m) is, and how even: the signal is {T > 0.5}."""
+    """Shares of the light of an image (m, m), and its uniformity; the signal is {T > 0.5}."""
     lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
     return {

@@ -16,7 +16,7 @@ from litho_data.foundation.results import Record
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
-# Drawn at a time: a large picture in double precision takes more memory than its design.
+# Rows drawn at a time, because a large picture in double precision takes more memory than its design.
 _ROWS = 256
 
 
@@ -38,7 +38,7 @@ class TargetRecord(Record):
         return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
-# What a lens images: a drawing by its name, or a picture, whose pixels are kept beside the settings.
+# An object of a lens: a drawing by its name, or a picture, whose pixels are kept beside the settings.
 ImagedObject = str | TargetRecord
 
 
@@ -81,10 +81,10 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:
-    """Width of the strokes of a target (size, size) in [0, 1]: the median along their middle lines."""
+    """Width of the strokes of a target (size, size) in [0, 1], px: the median along their middle lines."""
     import cv2
 
-    # At twice the size even widths, too, have a middle pixel; its distance to the dark is the width.
+    # At twice the size, even widths have a middle pixel, too; its distance to the dark is the width.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
     middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))
@@ -111,7 +111,7 @@ def _text(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _letters(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Rows of small letters and digits: fine detail of many directions."""
+    """Rows of small letters and digits: fine detail in many directions."""
     return _words(y, ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
 
 
@@ -163,7 +163,7 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
-    """A picture in grey (ny, nx), in the numbers of its file, and the conversions, one phrase each.
+    """A picture in grey (ny, nx), with the values of its file, and the conversions, one phrase each.
 
     Raises:
         InputError: no file, or not a readable image.
@@ -191,7 +191,7 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
     Args:
         path: any format and bit depth that OpenCV reads; grey values are taken as brightness.
         size_px: side of the square.
-        what: its name in error messages.
+        what: name of the picture in error messages.
 
     Returns:
         float32 (size, size) in [0, 1], and the conversions, one phrase each.

@@ -1,4 +1,4 @@
-"""The design-to-manufacturing gap: every arm's designs as printed by every judge, over seeds."""
+"""The design-to-manufacturing gap: the designs of every arm and seed, as printed by every judge."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # From the fewest fields to the most: a task of one's own has those of every design.
+    # In order of the number of fields; a task of your own has the fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
@@ -75,7 +75,7 @@ class GapResult(RunFacts, Result):
 
 
 def design_folder(out: Path, arm: str, seed: int) -> Path:
-    """Where the design of one arm and seed lies."""
+    """Folder of the design of one arm and seed."""
     return out / DESIGNS / arm / f"seed{seed}"
 
 
@@ -102,7 +102,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """The given figures of every arm against every other one, under each judge."""
+    """The given figures of every arm minus those of every other arm, under each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))

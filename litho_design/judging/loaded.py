@@ -1,4 +1,4 @@
-"""A finished design, read back from its folder: any judge can print and score it."""
+"""A finished design, read back from its folder, for any judge to print and score."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LoadedDesign:
     """The layout of a design folder, its optics and its scores, whatever its task.
 
     Attributes:
-        folder: where it lies.
+        folder: folder of the design.
         record: what ``design.json`` holds.
         level: layout (size, size).
         expected_um: height (size, size), µm, of the print that the design expects.
@@ -55,7 +55,7 @@ class LoadedDesign:
         self.level, self.expected_um = (self._tensor(name) for name in (LEVELS_FILE, HEIGHT_FILE))
         own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, UNPRINTABLE_FILE}
         arrays = [name for name in self.record.files if name.endswith(".npy") and name not in own]
-        # A design is opened to be scored: its task needs a device, and no model.
+        # The design is only scored, so its task needs a device but no model.
         nominal = Printer(None, self.record.layout, source="none").to(self.device)
         kind = registered_task(self.record.task)
         inputs = {name.removesuffix(".npy"): read_array(folder, name) for name in arrays}
@@ -77,7 +77,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
-        """Height (size, size), µm, that ``judge`` prints from the layout."""
+        """Height (size, size), µm, of the layout as printed by ``judge``."""
         return judge(self.level[None, None].float())[0, 0]
 
     @torch.no_grad()
@@ -90,7 +90,7 @@ class LoadedDesign:
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """The image as reports show it: scaled to its target, or the root of a PSF over its peak."""
+        """The image as reports show it: scaled to its target; for a PSF, the root of PSF over peak."""
         return self.task.display(image)
 
     @property
@@ -100,7 +100,7 @@ class LoadedDesign:
 
     @property
     def frame_um(self) -> float:
-        """Side of what a lens images, or of the image of another task, µm."""
+        """Side of a lens's objects, or of the image of another task, µm."""
         if not isinstance(self.task, LensTask):
             return self.window_um
         imaging = self.task.settings.imaging

@@ -25,9 +25,9 @@ _SMALLEST_COVERAGE = 0.8
 # Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# Dust is higher than what a print is off by chance, and wider than a step.
+# Dust is higher than random errors of a print, and wider than a step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# Of what a tip changes, this share stays open.
+# This share of the change by a tip remains uncertain.
 _TIP_SD = 0.3
 
 
@@ -36,12 +36,12 @@ class MeasuredSource:
     """A height map of the printed part; unit and size for files that do not state them.
 
     Attributes:
-        levelling: what is removed of the scan: nothing, a plane, or a polynomial of second order (bow).
+        levelling: what is removed from the scan: nothing, a plane, or a polynomial of second order (bow).
         scale_sd: relative standard uncertainty of its heights; a calibrated microscope's is about 0.02.
-        aligned: it lies on the pixels of the element already, upright: nothing is registered. For elements
-            that look alike in several places or orientations, such as a lens cap or a blaze.
-        tip_um: radius of the microscope's tip, whose widening is taken off; 0 for none. Without it, what the
-            scan itself tells of it.
+        aligned: the scan already lies on the pixels of the element, upright, and is not registered. For
+            elements that look alike in several places or orientations, such as a lens cap or a blaze.
+        tip_um: radius of the microscope's tip, whose widening of the print is removed; 0 for none, None to
+            estimate it from the scan.
     """
 
     path: Path
@@ -54,11 +54,12 @@ class MeasuredSource:
 
 
 class MeasuredRecord(Record):
-    """The scan, its agreement with the expected print, and what was done to it.
+    """The scan, its agreement with the expected print, and how it was processed.
 
     ``orientation`` is the operation that brings the scan onto the layout. ``tilt_um_per_um`` (x, y) and
-    ``bow_um``, the range of the curved part over the element, were removed; ``noise_um`` is what is left
-    at frequencies that no print has. In ``defect_share`` of the element dust or scars stand for the print.
+    ``bow_um``, the range of the curved part over the element, were removed; ``noise_um`` is the remainder at
+    frequencies that no print has. ``defect_share`` is the share of the element that shows dust or scars
+    instead of the print.
     """
 
     name: str
@@ -80,9 +81,9 @@ class MeasuredRecord(Record):
     tip_change_um: float
 
     def remarks(self) -> list[str]:
-        """What was removed, and whether the scan lies as the layout does, one phrase each."""
+        """Remarks on what was removed and on the orientation of the scan, one phrase each."""
         found = [] if not self.warning else [self.warning]
-        found += ["the scan was taken as it lies"] if self.aligned else []
+        found += ["the scan was taken as it is, without registration"] if self.aligned else []
         if self.orientation != "identity":
             found.append(f"the scan was brought onto the layout by {self.orientation}")
         if self.levelling == "none":
@@ -97,7 +98,7 @@ class MeasuredRecord(Record):
         if self.tip_um:
             change = f"{1000 * self.tip_change_um:.0f} nm rms"
             found.append(
-                f"a tip of {1000 * self.tip_um:.0f} nm was taken off, which changes heights by {change}"
+                f"the widening by a tip of {1000 * self.tip_um:.0f} nm was removed, a change of {change}"
             )
         return found
 
@@ -105,14 +106,14 @@ class MeasuredRecord(Record):
 def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor, MeasuredRecord]:
     """The measured height of a printed design on its layout's pixels.
 
-    The zero of an AFM map is arbitrary, and a constant height is only a constant phase: the zero is set so
-    that the medians of measured and designed print agree. Tilt and bow of the scanner are fitted together
-    with the designed print, so that they take nothing of its own shape. Unmeasured pixels take the
-    designed print.
+    The zero of an AFM map is arbitrary, and a constant height is only a constant phase, so the zero is set to
+    make the medians of measured and designed print agree. Tilt and bow of the scanner are fitted together
+    with the designed print, so that they remove nothing of its own shape. Unmeasured pixels take their value
+    from the designed print.
 
     Args:
         loaded: the design.
-        source: in any format that ``litho-data inspect`` reads.
+        source: the scan, in any format that ``litho-data inspect`` reads.
 
     Returns:
         Height (size, size), µm, and its record.
@@ -178,7 +179,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """A scan without what its tip widened, the radius of that, and the rms change of heights, µm."""
+    """A scan without the widening by its tip, the radius of the tip, and the rms change of heights, µm."""
     from litho_data.tip import estimate_tip, paraboloid_erosion
 
     radius_um = tip_um
@@ -195,12 +196,12 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 
 
 def _defects(off_um: np.ndarray) -> np.ndarray:
-    """Dust and scars, by what a print (ny, nx) is off from its expectation, µm, without tilt and bow."""
+    """Dust and scars in the deviation of a print (ny, nx) from its expectation, µm, without tilt and bow."""
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     from litho_data.level.scars import mark_scars
 
-    # Steps that lie a pixel aside are high on one side and low on the other; a blur takes them out.
+    # Steps displaced by a pixel deviate up on one side and down on the other, so a blur removes them.
     smooth = gaussian_filter(off_um, _DUST_BLUR_PX)
     middle = np.median(smooth)
     spread = 1.4826 * float(np.median(np.abs(smooth - middle)))
@@ -211,7 +212,7 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
 
 class _Placed(NamedTuple):
-    """A scan on the pixels of the layout (ny, nx): heights, where measured; how it came there, how surely."""
+    """A scan on the pixels of the layout (ny, nx): heights, measured pixels, transform, uncertainties."""
 
     height_um: np.ndarray
     valid: np.ndarray
@@ -282,7 +283,7 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Prints (ny, nx), µm, that the scan would also allow: other noise, place, scale of heights, tip."""
+    """Prints (ny, nx), µm, that are as plausible: with other noise, position, scale of heights and tip."""
     from scipy.ndimage import shift
 
     from litho_data.tip import paraboloid_erosion

@@ -24,14 +24,14 @@ from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
-# A score that is less sure decides nothing between designs.
+# A score with a larger standard deviation cannot decide between designs.
 _LARGEST_SD_DB = 0.5
-# Of what a blur of the camera changes, this share stays open.
+# This share of the change by a blur of the camera remains uncertain.
 _BLUR_SD = 0.3
 
 
 class PhotoScore(Record):
-    """Figures of a photographed image; its efficiencies only where the incident power is known."""
+    """Figures of a photographed image; efficiencies only if the incident power is known."""
 
     si_psnr_db: float
     ssim: float
@@ -47,8 +47,8 @@ class PhotoScore(Record):
 class LensPhotoScore(Record):
     """Error, PSNR and SSIM of one photographed object, each image at the scale of least error.
 
-    ``direct`` is the photograph itself, ``design`` its deconvolution with the PSF that the design
-    expected, ``calibrated`` that with the PSF of the measured print (None where none was measured).
+    ``direct`` is the photograph itself, ``design`` its deconvolution with the PSF that the design expected,
+    ``calibrated`` its deconvolution with the PSF of the measured print (None without a measurement).
     """
 
     mae_direct: float
@@ -76,8 +76,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     """Score a photograph of a printed hologram's image.
 
     Raises:
-        InputError: what ``photographed_image`` refuses, an incident power that is not positive, an object
-            in front of a hologram, or noise that leaves the score open.
+        InputError: what ``photographed_image`` refuses, an incident power that is not positive, an object in
+            front of a hologram, or noise that makes the score too uncertain.
     """
     assert loaded.target is not None
     if source.imaged is not None:
@@ -98,7 +98,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
     image = photo.image()
     freed, uncertainty = freed_of_noise(figures, figures(image), photo.as_it_might_be())
-    # A blur beyond the expected image is the camera's or the print's: part of what it changes stays open.
+    # A blur beyond the expected image may come from the camera or the print, so part of its effect stays
+    # open.
     sharp, soft = (
         photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
         for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
@@ -118,13 +119,13 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
 def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
-    # The finest fringes are those of rays from two sides of the element.
+    # Rays from two opposite sides of the element make the finest fringes.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
     return photographed_image(wanted, pitch_um, source, finest_per_um)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Figures of a registered photograph (m, m) against its target and the target as far as it resolves."""
+    """Figures of a registered photograph (m, m) against its target and the target at its resolution."""
     share = torch.from_numpy(image).double()
     found = likeness(share, target, resolved) | light_figures(share, target)
     known = {name: value for name, value in found.items() if has_power or not name.startswith("eff_")}
@@ -137,10 +138,9 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    The photograph is cleaned and registered by ``photographed_image`` on the image that the design
-    expects of the object, on the sensor pixels of the design, and deconvolved by Richardson-Lucy with
-    its number of iterations. The image of the object must have the size of the design's, or its PSFs do
-    not fit.
+    ``photographed_image`` cleans the photograph and registers it on the image that the design expects of the
+    object, on the design's sensor pixels. Then it is deconvolved by Richardson-Lucy with the design's number
+    of iterations. The image of the object must have the size of the design's image, or the PSFs do not fit.
 
     Args:
         loaded: a lens's design.
@@ -149,8 +149,8 @@ def score_lens_photo(
         printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
 
     Raises:
-        InputError: no object, an unknown one or a name that two have, or what ``photographed_image``
-            refuses.
+        InputError: no object, an unknown object, a name that two objects share, or what
+            ``photographed_image`` refuses.
     """
     assert isinstance(loaded.task, LensTask)
     wanted, which = _object(loaded.task, source.imaged)

@@ -1,4 +1,4 @@
-"""Score a design as others print, measure or photograph it; always the layout that would be printed."""
+"""Scores of a design as printed by models, measured or photographed; always of the printable layout."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
     ``uncertainty`` holds one standard deviation of a measured figure; None for models.
-    With ``stitching`` the print is made of displaced write fields: figures are means over some draws of their
-    places, uncertainties the standard deviation of one.
+    With ``stitching`` the print is made of displaced write fields: figures are means over some draws of the
+    displacements, uncertainties the standard deviation of one draw.
     """
 
     kind: Literal["model", "scan", "camera"]
@@ -66,7 +66,7 @@ class JudgedScore(Record):
         )
 
     def remarks(self) -> list[str]:
-        """What was done to a measurement, and what stays open about it, one phrase each."""
+        """Remarks on how a measurement was processed and what is uncertain about it, one phrase each."""
         found = [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
         if self.stitching is not None:
             sigma_um, field_um = self.stitching.sigma_um, self.stitching.field_um
@@ -92,12 +92,12 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
-    # Of the design over doing nothing, where it was compared with that.
+    # Gain of the design over doing nothing, if it was compared with that.
     gain: float | None = None
 
     @classmethod
     def of(cls, folder: Path, record: Design, scores: list[JudgedScore]) -> ScoreResult:
-        """What this run found about the design in a folder."""
+        """The result of this run for the design in a folder."""
         return cls(
             **run_facts(),
             design=str(folder),
@@ -147,7 +147,7 @@ def judge_design(
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
-        stitch: write fields that the prints of the models are made of; in one piece by default.
+        stitch: write fields of the models' prints; by default they are printed in one piece.
 
     Raises:
         InputError: a measurement that does not match the design.

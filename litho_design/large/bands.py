@@ -1,7 +1,7 @@
-"""Bands of rows: the unit in which a large element is printed and transformed, and who holds which.
+"""Bands of rows, the unit in which a large element is printed and transformed, and their processes.
 
-Bands are those of the layout, whoever computes them: an element has the same ones, and in each of them the
-same numbers, with one process and with many.
+The bands depend only on the layout: an element has the same bands with the same numbers, whether one process
+computes them or many.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 
-# Rows of a band at most. Memory for a print grows with its square, and bands are the most processes that
-# can share an element; below some four times the model's reach most of the time goes into what is printed
-# twice.
+# Most rows of a band. Memory for a print grows with their square, and an element cannot be shared by more
+# processes than it has bands. Below about four times the model's reach, most of the time goes into rows that
+# are printed twice.
 BAND_PX = 512
 
 
@@ -42,16 +42,16 @@ class Ranks:
         return cls(dist.get_rank(), dist.get_world_size())
 
     def device(self, device: str | torch.device) -> str | torch.device:
-        """``device`` for this process: each takes a GPU of its own where ``cuda`` is asked for."""
+        """``device`` for this process; with ``cuda`` each process takes a GPU of its own."""
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
-        """Which of ``count`` things in a row are those of a process, by default of this one."""
+        """The range among ``count`` items that belongs to a process, by default this one."""
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)
 
     def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-        """Send ``parts[r]`` to process r, and get from each ``sizes[r]`` entries, flat one after the other.
+        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated flat.
 
         Args:
             parts: one tensor per process, real or complex, of one dtype.
@@ -60,7 +60,7 @@ class Ranks:
             return parts[0].reshape(-1)
         sent = torch.cat([part.reshape(-1) for part in parts])
         received = sent.new_empty(sum(sizes))
-        # The collectives of gloo know no complex numbers.
+        # The collectives of gloo do not support complex numbers.
         to, of = (torch.view_as_real(one) if one.is_complex() else one for one in (received, sent))
         dist.all_to_all_single(to, of, list(sizes), [part.numel() for part in parts])
         return received
@@ -68,17 +68,17 @@ class Ranks:
     def total(self, values: Tensor) -> Tensor:
         """Sum over the values of all processes in double precision, () float64.
 
-        Differentiable: what each of them does with the sum counts in the gradient (see ``shared_loss``).
+        Differentiable: the gradient adds up what every process does with the sum (see ``shared_loss``).
         """
         total: Tensor = _Total.apply(values.sum(dtype=torch.float64), self)
         return total
 
     def shared_loss(self, loss: Tensor) -> Tensor:
-        """A loss that all processes have: it counts once when each of them sends its gradient back."""
+        """A loss that all processes share; its gradient is scaled so that the loss counts once."""
         return (loss - loss.detach()) / self.count + loss.detach()
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Wait until all processes are here."""
         if self.count > 1:
             dist.barrier()
 
@@ -103,13 +103,13 @@ def _summed(value: Tensor, ranks: Ranks) -> Tensor:
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a square element, and those that this process holds.
+    """The bands of a square element, and those of this process.
 
     Args:
         size_px: side of the element.
-        most_px: rows of a band at most; all have the same number but the last, which may have fewer.
+        most_px: most rows of a band; all bands have the same number, only the last may have fewer.
         ranks: the processes.
-        cell_px: side of a free cell, which no band cuts.
+        cell_px: side of a free cell; no band cuts a cell.
 
     Raises:
         InputError: more processes than bands.
@@ -137,7 +137,7 @@ class Bands:
 
     @property
     def count(self) -> int:
-        """How many bands the element has."""
+        """Number of bands of the element."""
         return -(-self.size_px // self.band_px)
 
     def rows(self, rank: int | None = None) -> range:
@@ -146,12 +146,12 @@ class Bands:
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
     def own(self) -> list[slice]:
-        """The bands of this process, as rows of what it holds."""
+        """The bands of this process, as slices of its own rows."""
         rows = len(self.rows())
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 
     def check_halo(self, halo: int) -> None:
-        """Refuse bands so narrow that a row counts in the surroundings of two others.
+        """Refuse bands so narrow that a row lies in the halos of two other bands.
 
         Raises:
             InputError: fewer rows than twice the halo, or than the halo in the last band.
@@ -166,7 +166,7 @@ class Bands:
             )
 
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
-        """The own rows (rows, x) with ``halo`` of the neighbours' on both sides, zero beyond the element.
+        """The own rows (rows, x) with ``halo`` rows of the neighbours on both sides, zero beyond the element.
 
         ``add_halo`` is its adjoint.
         """
@@ -178,7 +178,7 @@ class Bands:
         return around
 
     def add_halo(self, around: Tensor, halo: int) -> Tensor:
-        """Own rows with what others found for them: each sends its ``halo`` rows to whom they belong."""
+        """Add to the own rows what neighbours computed for them; each sends ``halo`` rows to their owner."""
         own = around[halo : len(around) - halo].clone()
         if halo:
             before, after = self._from_neighbours(around[:halo], around[-halo:])
@@ -187,7 +187,7 @@ class Bands:
         return own
 
     def _from_neighbours(self, first: Tensor, last: Tensor) -> list[Tensor]:
-        """What the processes before and after send here when each sends its ends to its neighbours."""
+        """What the neighbouring processes send: each sends ``first`` and ``last`` to its own neighbours."""
         rank, count = self.ranks.rank, self.ranks.count
         parts, sizes = [first[:0]] * count, [0] * count
         sides = {rank - 1: first, rank + 1: last}

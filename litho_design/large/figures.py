@@ -1,4 +1,4 @@
-"""Figures of an image of any size, on disk or not, a band of rows at a time.
+"""Figures of an image of any size, in memory or on disk, a band of rows at a time.
 
 They have the names and meanings of ``HologramScore``; those that need the whole image at once (camera,
 resolved target, uniformity) are left out.
@@ -51,7 +51,7 @@ def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[s
 
 
 def preview(image: np.ndarray, bands: Bands) -> np.ndarray:
-    """An image of at most about 1,024 px a side: means over squares of pixels."""
+    """The image reduced to about 1,024 px a side at most, by means over squares of pixels."""
     step = -(-bands.size_px // _PREVIEW_PX)
     side = bands.size_px // step
     rows = [
@@ -69,7 +69,7 @@ def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands)
         seen = scale * np.asarray(image[first:last], np.float64)
         clipped += int((seen[band.start - first : band.stop - first] > 1).sum())
         found = ssim_map(np.clip(seen, 0, 1), np.asarray(target[first:last], np.float64))
-        # Windows that reach over the edge of the element do not count.
+        # Windows that extend over the edge of the element do not count.
         inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
         total += float(found[inner, around : size - around].sum())
     return total / (size - 2 * around) ** 2, clipped / size**2

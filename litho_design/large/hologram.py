@@ -1,4 +1,4 @@
-"""A hologram in bands: the task of an element in one piece, for the rows of this process."""
+"""A hologram in bands: the task of a hologram in one piece, restricted to the rows of this process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LEFT_OUT = (
     "a large element: without polish, process window, baselines, thick element and report; the figures that "
     "need the whole image at once are left out"
 )
-# What a large element does not have: only these values.
+# A large element supports only these values of these settings.
 ONLY: dict[str, Any] = {
     "search.parametrisation": "direct",
     "optics.element": "thin",
@@ -48,19 +48,19 @@ ONLY: dict[str, Any] = {
 
 
 class BandedHologram(HologramTask):
-    """The loss of the rows that this process holds, and of those of all others with them.
+    """A hologram whose rows are shared by several processes; each computes the loss of the whole.
 
-    All processes run it with the same arguments, and share the file system of the folder. The layout is the
-    same for any number of them.
+    All processes run it with the same arguments and share the file system of the folder. The layout does not
+    depend on their number.
 
     Args:
-        settings: of the hologram.
+        settings: settings of the hologram.
         printer: frozen model with a finite reach, or nominal heights.
         target: wanted image (size, size) in [0, 1].
-        bands: of the element.
+        bands: bands of the element.
 
     Raises:
-        InputError: settings or a printer that a large element cannot have.
+        InputError: settings or a printer that a large element does not support.
     """
 
     polished = reported = False
@@ -78,15 +78,15 @@ class BandedHologram(HologramTask):
         self.notes = [_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"]
 
     def inputs_sha256(self) -> str:
-        """Bands decide the rounding of a sum, and so the layout."""
+        """The bands are included, because they decide the rounding of sums and so the layout."""
         return f"bands of {self.bands.band_px}"
 
     def make_cells(self) -> CellMap:
-        """Of the own rows."""
+        """The cells of the own rows."""
         return CellMap(self.settings.layout, self.bands.rows())
 
     def make_bench(self, optics: Optics) -> Any:
-        """Light onto the own rows of the image plane."""
+        """The bench from the element to the own rows of the image plane."""
         return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
 
     def search_print(self, level: Tensor, printer: int) -> Tensor:
@@ -94,7 +94,7 @@ class BandedHologram(HologramTask):
         return print_bands(level[0, 0], self.printers[printer], self.bands)
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of the whole element, of the own levels (1, 1, rows, size), and its parts."""
+        """Loss of the whole element and its parts, from the own levels (1, 1, rows, size)."""
         loss, parts = super().objective(level)
         return self.bands.ranks.shared_loss(loss), parts
 
@@ -105,14 +105,14 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays that all processes share; the first of them gets the hashes."""
+        """Write the arrays that all processes share; only the first process gets the hashes."""
         seen = self.bench(height_um)
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: seen}
         self.saved = folder
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
     def findings(self, level: Tensor, height_um: Tensor) -> Findings:
-        """Figures of the whole, which is on disk."""
+        """Figures of the whole element, from disk."""
         levels, seen, aim = (
             np.load(self.saved / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )
@@ -124,29 +124,29 @@ class BandedHologram(HologramTask):
         )
 
     def finished_iterations(self, folder: Path) -> int:
-        """Those that all processes have done.
+        """Iterations that all processes have finished.
 
         Raises:
-            InputError: some have done others, or there were other processes.
+            InputError: the processes differ in their iterations, or their number has changed.
         """
         done, ranks = super().finished_iterations(folder), self.bands.ranks
         others = list(folder.glob("checkpoint*.pt"))
         if float(ranks.total(torch.tensor([float(done)]))) != done * ranks.count or (others and not done):
             raise InputError(
                 f"checkpoints in {folder}",
-                got="those of another number of processes, or of different iterations",
+                got="checkpoints of another number of processes, or of different iterations",
                 wanted=f"one of the same iteration from each of {ranks.count}",
                 hint="start as many processes as before, or delete them to start again",
             )
         return done
 
     def together(self, value: bool) -> bool:
-        """Whether this holds for any of the processes, when all are here."""
+        """Whether ``value`` holds for any process; waits for all of them."""
         return bool(self.bands.ranks.total(torch.tensor([float(value)])) > 0)
 
 
 class BandedBench(nn.Module):
-    """Light of one plane wave through the own rows of an element onto those of the image plane."""
+    """Light of one plane wave through the own rows of an element onto the own rows of the image plane."""
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: torch.device):
         super().__init__()
@@ -158,16 +158,16 @@ class BandedBench(nn.Module):
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Share of the incident power on the own pixels (rows, size) behind the own heights, µm."""
+        """Share of the incident power on the own pixels (rows, size), from the own heights, µm."""
         field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
         return intensity_share(self.propagator(field), self.rows)
 
 
 def only(settings: Record, values: dict[str, Any]) -> None:
-    """Refuse settings, by path, that a large element does not have.
+    """Refuse settings, by path, that a large element does not support.
 
     Raises:
-        InputError: another value.
+        InputError: a value other than the one in ``values``.
     """
     for path, wanted in values.items():
         given: Any = settings
@@ -179,7 +179,7 @@ def only(settings: Record, values: dict[str, Any]) -> None:
 
 
 def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
-    """Write arrays whose own rows (rows, size) each process has, by file name; their SHA-256 in the first."""
+    """Write arrays from the own rows (rows, size) of each process; SHA-256 by file name in the first."""
     size, rows, hashes = bands.size_px, bands.rows(), {}
     for name, values in arrays.items():
         own = values.cpu().numpy()

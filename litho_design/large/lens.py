@@ -1,6 +1,6 @@
-"""A lens of any size ring by ring: a strip along one radius is printed, and the wave of rings is carried.
+"""A lens of any size, ring by ring: a strip along one radius is printed, and a wave of rings propagated.
 
-Nothing of the plane is ever made: an element of 10 mm is 50,000 rings of 0.1 µm, not 10¹⁰ pixels.
+The plane is never computed: an element of 10 mm is 50,000 rings of 0.1 µm, not 10¹⁰ pixels.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ class RingLens(DirectLensTask):
     """A direct lens of rings, printed along a radius in tiles.
 
     Args:
-        settings: of the lens, with rings, a circular aperture and a thin element.
+        settings: settings of the lens, with rings, a circular aperture and a thin element.
         printer: a frozen model with a finite reach, or nominal heights.
         tile_px: length of the tiles in which the strip is printed.
-        bench: of another lens with these settings, whose matrix takes its time.
+        bench: bench of another lens with these settings, to reuse its matrix, which takes time to compute.
 
     Raises:
-        InputError: settings or a printer that a lens of rings cannot have.
+        InputError: settings or a printer that a lens of rings does not support.
     """
 
     polished = reported = False
@@ -85,10 +85,10 @@ class RingLens(DirectLensTask):
         self.tile_px, self._bench = tile_px, bench
         Task.__init__(self, settings, printer)
         self._strip = strip_rings(settings.layout, printer.halo_px, self.cells.cells[0]).to(printer.device)
-        self.notes = ["a lens in rings: levels and heights along one radius; no layout of the plane"]
+        self.notes = ["a lens of rings: levels and heights along one radius; no layout of the plane"]
 
     def inputs_sha256(self) -> str:
-        """Nothing else decides the layout."""
+        """Empty: nothing else decides the layout."""
         return "rings"
 
     def make_cells(self) -> CellMap:
@@ -96,14 +96,14 @@ class RingLens(DirectLensTask):
         return RadiusMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """Along the radius."""
+        """The bench along the radius."""
         return self._bench or RadialLensBench(self.settings.layout, optics, self.settings.view).to(
             self.printer.device
         )
 
     @cached_property
     def scenes(self) -> list[Any]:
-        """The lens as modelled."""
+        """Only the lens as modelled."""
         return [(None, self.bench)]
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
@@ -145,9 +145,9 @@ class RingLens(DirectLensTask):
 
 @torch.no_grad()
 def judge_rings(folder: Path, record: Design, judges: Sequence[Printer]) -> Judgement:
-    """Print the rings of a design by models, and score them along the radius.
+    """Score the rings of a design along the radius, as printed by models.
 
-    Heights differ over the plane; the pictures are square roots of PSFs over their peaks.
+    Height differences are taken over the plane; the pictures are square roots of PSFs over their peaks.
 
     Raises:
         InputError: rings that changed after the design, or a judge without a finite reach.

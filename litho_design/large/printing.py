@@ -1,4 +1,4 @@
-"""Prints of an element in bands: one band at a time, for gradients a second time."""
+"""Prints of an element in bands, one band at a time; gradients print each band again."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def check_printer(printer: Printer, bands: Bands) -> None:
     """Refuse a printer that cannot print in bands.
 
     Raises:
-        InputError: a print that depends on the whole image or on the place in the write field, or bands
-            narrower than its reach.
+        InputError: a print that depends on the whole image or on the position in the write field, or bands
+            narrower than the printer's reach.
     """
     whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     if whole or printer.depends_on_position:
@@ -34,8 +34,8 @@ def check_printer(printer: Printer, bands: Bands) -> None:
 def print_bands(level: Tensor, printer: Printer, bands: Bands) -> Tensor:
     """Printed height, µm, of the own rows of levels (rows, size); gradients flow to the levels.
 
-    Each band is printed in tiles as long as it is high, with what the printer reaches around them. Nothing of
-    a print is kept: for the gradient each tile is printed again.
+    Each band is printed in square tiles with the printer's reach around them. No intermediate result is kept:
+    the gradient prints each tile again.
     """
     printed: Tensor = _Print.apply(level, printer, bands)
     return printed
@@ -50,7 +50,7 @@ def print_band(around: Tensor, printer: Printer, tile_px: int) -> Tensor:
 
 
 def tiles(wide: Tensor, printer: Printer, tile_px: int) -> list[slice]:
-    """Columns of the tiles of a band (y, x) that has its halo on all sides, theirs included."""
+    """Columns of the tiles, including their halos, of a band (y, x) with its halo on all sides."""
     border = 2 * printer.halo_px
     length = wide.shape[1] - border
     return [slice(at, min(at + tile_px, length) + border) for at in range(0, length, tile_px)]
@@ -78,12 +78,12 @@ class _Print(torch.autograd.Function):
         for band in bands.own():
             reached = slice(band.start, band.stop + 2 * halo)
             found[reached] += _band_gradient(around[reached], gradient[band], printer, bands.band_px)
-        # A row has at most two bands around it: the sum is the same in any order.
+        # At most two bands contribute to a row, so the sum is the same in any order.
         return bands.add_halo(found, halo), None, None
 
 
 def _band_gradient(around: Tensor, gradient: Tensor, printer: Printer, tile_px: int) -> Tensor:
-    """Gradient of a band's levels and of those around it, from that of its height (y, x)."""
+    """Gradient with respect to the levels of a band and its halo, from that of its height (y, x)."""
     halo = printer.halo_px
     wide = F.pad(around, (halo, halo))
     found = torch.zeros_like(wide)

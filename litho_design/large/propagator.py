@@ -1,4 +1,4 @@
-"""A wave carried to a parallel plane by a Fourier transform that several processes share.
+"""Propagation of a wave to a parallel plane by a Fourier transform that several processes share.
 
 Rows are transformed where they lie; one exchange gives every process whole columns; these are transformed,
 multiplied and transformed back, and a second exchange returns the rows (Takahashi, Fast Fourier Transform
@@ -25,10 +25,10 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """As ``make_propagator`` between equal grids, of a field whose bands of rows are shared.
+    """Like ``make_propagator`` between equal grids, for a field whose bands of rows are shared.
 
     Field and result are the rows of this process, complex64 (rows, size). The kernel is even along both axes,
-    so that half of each column of its transform is kept.
+    so only half of each column of its transform is kept.
 
     Args:
         pitch_um: pixel, µm.
@@ -36,7 +36,7 @@ class BandedPropagator:
         bands: of the element.
 
     Raises:
-        InputError: a distance at which the Rayleigh-Sommerfeld kernel is aliased, where that is asked for.
+        InputError: the Rayleigh-Sommerfeld kernel is requested but aliased at this distance.
     """
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: Device = "cpu"):
@@ -57,12 +57,12 @@ class BandedPropagator:
         (self._spectrum_transfer if spectrum else self._kernel_transfer)(optics)
 
     def __call__(self, field: Tensor) -> Tensor:
-        """Carry the field; gradients go back by the adjoint."""
+        """Propagate the field; gradients flow back through the adjoint."""
         carried: Tensor = _Carry.apply(field, self)
         return carried
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """P^H of the propagation: it sends a field back."""
+        """P^H of the propagation, which sends a field back."""
         return self.carried(field, conjugate=True)
 
     def carried(self, field: Tensor, *, conjugate: bool = False) -> Tensor:
@@ -72,7 +72,7 @@ class BandedPropagator:
         for block in self._blocks:
             wave = torch.fft.fft(columns[:, block].T.contiguous(), n=self.length)
             half, rest = self._transfer[block], self.length - self.length // 2 - 1
-            # Above the middle frequency stand the same numbers, backwards.
+            # Above the middle frequency the same numbers follow in reverse.
             mirrored = half[:, 1 : rest + 1].flip(1)
             wave[:, : half.shape[1]] *= half.conj() if conjugate else half
             wave[:, half.shape[1] :] *= mirrored.conj() if conjugate else mirrored
@@ -83,7 +83,7 @@ class BandedPropagator:
         return carried
 
     def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
-        """Transformed rows, one band after the other, as whole columns: (size, own columns)."""
+        """Transform the rows band by band and exchange them for whole columns: (size, own columns)."""
         bands, ranks = self.bands, self.bands.ranks
         rows = self._room(len(bands.rows()), self.length)
         for band in bands.own():
@@ -117,7 +117,7 @@ class BandedPropagator:
         """The transform of the Rayleigh-Sommerfeld kernel: rows in double, then columns in double."""
         pitch, size = self.source.pitch_um[0], self.bands.size_px
         check_distance(optics.distance_um, self.source, self.target, optics.wavelength_um)
-        # Pixels between source and target in wrapped order; places out of use repeat the largest.
+        # Pixels between source and target in wrapped order; unused places repeat the largest.
         index = torch.arange(self.length)
         wrapped = torch.minimum(index, self.length - index).clamp(max=size - 1)
         away_um, below_um = wrapped.double() * pitch, torch.arange(size).double() * pitch
@@ -133,7 +133,7 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """The transfer function of free space; small elements want a longer period for it than theirs."""
+        """The transfer function of free space; small elements need a longer period than their own."""
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]
         rows, columns = spectrum_axes(*given)

@@ -1,4 +1,4 @@
-"""Score of a hologram that is printed band by band."""
+"""Scores of a hologram that is printed band by band."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARG
 def judge_in_bands(
     folder: Path, record: Design, judges: Sequence[Printer], band_px: int, stitch: Stitching | None
 ) -> Judgement:
-    """Score the layout of a hologram by models that print it band by band, in 64 bytes per pixel.
+    """Score the layout of a hologram as models print it band by band, in 64 bytes per pixel.
 
     Args:
-        stitch: write fields that the prints are made of; one draw of their places, as there are many.
+        stitch: write fields of the prints; one draw of their displacements is enough, as there are many.
 
     Raises:
-        InputError: a design that is no hologram of a thin element, or a judge without a finite reach.
+        InputError: a design that is no thin hologram, or a judge without a finite reach.
     """
     layout, optics = record.layout, record.optics
     if record.task != "hoe" or optics.element != "thin":

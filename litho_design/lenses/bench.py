@@ -26,7 +26,7 @@ CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """What the benches of a plane and of rings share: aperture, focal window, the perfect lens."""
+    """The common part of the benches of a plane and of rings: aperture, focal window, perfect lens."""
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
@@ -52,14 +52,14 @@ class LensOptics(nn.Module):
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
 
     def radius_um(self) -> Tensor:
-        """Distance from the axis, float64, µm, of each height that is asked for."""
+        """Distance from the axis of each height, float64, µm."""
         raise NotImplementedError
 
     def ideal_height_um(self) -> Tensor:
         """Heights of a perfect lens, wrapped to one wave, µm."""
         focal_um = self.optics.distance_um
         path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt()
-        # The height that delays the wave by the path difference; wrapping changes nothing.
+        # The height that delays the wave by the path difference; wrapping does not change the wave.
         height = path * self.optics.wave_height_um / self.optics.wavelength_um
         return torch.remainder(height, self.optics.wave_height_um).float()
 
@@ -82,7 +82,7 @@ class LensBench(LensOptics):
         return intensity_share(self.propagator(field), self.window)
 
     def radius_um(self) -> Tensor:
-        """Of each pixel (size, size)."""
+        """Distance from the axis of each pixel (size, size)."""
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
         return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
@@ -110,12 +110,12 @@ class RadialLensBench(LensOptics):
         """PSF (window, window) of ring heights (rings,), µm."""
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
-        # The wave is smooth on the scale of a pixel: interpolate it, not the intensity.
+        # The wave, unlike the intensity, is smooth on the scale of a pixel, so it is interpolated.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
     def radius_um(self) -> Tensor:
-        """Of the middle of each ring (rings,)."""
+        """Distance from the axis of the middle of each ring (rings,)."""
         rings = torch.arange(self.propagator.rings, dtype=torch.float64, device=self.share.device)
         return (rings + 0.5) * self.layout.pitch_um
 
@@ -123,8 +123,8 @@ class RadialLensBench(LensOptics):
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
     """Mean intensity of the central box over the mean of the rest of an element-sized image plane.
 
-    All light that misses the box counts as background, wherever it went: (1 - box) spread over the
-    area of the element. A ratio within the PSF window alone would reward light that is sent out of it.
+    All light that misses the box counts as background, wherever it went: (1 - box) spread over the area of
+    the element. A ratio within the PSF window alone would reward light sent outside the window.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()
@@ -133,7 +133,7 @@ def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor
 
 
 def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
-    """PSF on sensor pixels, cropped to an odd number of them around the axis."""
+    """PSF on sensor pixels, cropped to an odd number of pixels around the axis."""
     pixels = psf.shape[-1] // pixel_px
     pixels -= 1 - pixels % 2
     first = (psf.shape[-1] - pixels * pixel_px) // 2
@@ -144,7 +144,8 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
     """Sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
 
-    Photon noise is Gaussian here, too, with the variance of Poisson's; the gradient takes its size as given.
+    Photon noise, too, is Gaussian, with the variance of Poisson noise; the gradient treats its size as
+    constant.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)

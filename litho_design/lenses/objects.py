@@ -16,7 +16,7 @@ from litho_design.lenses.settings import LensSettings
 _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
-# Among the inputs of a lens: (pictures, size, size), those of the design first.
+# Name among the inputs of a lens: (pictures, size, size), the design's pictures first.
 _PICTURES = "object_pictures"
 
 
@@ -42,12 +42,12 @@ def with_objects(
     """``settings`` of a computational lens with your own pictures as objects.
 
     A path is a picture, or a folder whose files, except hidden ones, are all pictures.
-    Without ``held_out`` the last quarter of the pictures in the order of their names, two at least,
-    are held out of the design and only scored. Without ``objects`` the design uses the drawings.
+    Without ``held_out``, the last quarter of the pictures in the order of their names, at least two, are held
+    out of the design and only scored. Without ``objects``, the design uses the drawings.
 
     Returns:
         The settings, with name, SHA-256 and conversion of each picture, and the pixels as inputs of the task;
-        unchanged settings and no inputs where no path is given.
+        without paths, unchanged settings and no inputs.
 
     Raises:
         InputError: a task that images no objects, a file that is not a picture, a picture without light or
@@ -91,12 +91,12 @@ def pictures_of(objects: Sequence[ImagedObject], inputs: Mapping[str, np.ndarray
 
 
 def picture_records(objects: Sequence[ImagedObject]) -> list[TargetRecord]:
-    """Those of ``objects`` that are pictures."""
+    """The pictures among ``objects``."""
     return [item for item in objects if isinstance(item, TargetRecord)]
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
-    """One sentence that names the objects where some are pictures; nothing otherwise."""
+    """One sentence that names the objects if some are pictures; otherwise empty."""
     if not picture_records((*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))

@@ -1,4 +1,4 @@
-"""Scores of a lens: its PSF against that of a perfect lens, and the images it gives."""
+"""Scores of a lens: of its PSF against that of a perfect lens, and of its images."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, LensSettings
 from litho_design.optics.imaging import richardson_lucy
 
-# Figures of a lens that make sense where nothing focuses.
+# Figures of a lens that make sense even if nothing focuses.
 _OF_POWER = ("focusing_efficiency", "strehl", "cbr", "eff_window")
 _TEST_SEEDS = range(1000, 1003)
 
 
 class LensScore(Record):
-    """Powers are shares of what falls on the aperture; lengths are µm."""
+    """Powers are shares of the power on the aperture; lengths are in µm."""
 
     focusing_efficiency: float = Field(
         description="power within the focusing radius, share of the aperture's"
@@ -45,7 +45,7 @@ class LensScore(Record):
 
 
 class ImagingScore(Record):
-    """Means and standard deviations over test objects and noise seeds, never used in the design.
+    """Means and standard deviations over test objects and noise seeds that the design never used.
 
     ``design`` deconvolves with the PSF that the design expected, ``calibrated`` with the PSF of the
     print itself; ``direct`` is the sensor image without deconvolution, at the scale of least error.
@@ -175,7 +175,7 @@ def score_lens(
 def lens_baselines(
     settings: LensSettings, bench: LensBench, pictures: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, dict[str, float]]:
-    """Scores of a perfect lens, of a flat plate, and for a computational lens of black images, by name."""
+    """Scores of a perfect lens, a flat plate and, for a computational lens, black images, by name."""
     ideal = bench.ideal_height_um()
     flat = lens_score(bench, torch.zeros_like(ideal))
     found = {

@@ -1,4 +1,4 @@
-"""All settings of a lens, by preset: choices that the paper leaves open are stated here."""
+"""All settings of a lens, by preset, including the choices that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from litho_design.optimisation.settings import (
 )
 from litho_design.printers.layout import LayoutSettings
 
-# Of a difference in grey, where white is 1: what the published code has.
+# Difference in grey, with white = 1, as in the published code.
 SMOOTH_BELOW = 0.1
 
 LensTaskName = Literal["direct", "computational"]
@@ -31,7 +31,7 @@ LensTaskName = Literal["direct", "computational"]
 class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
-    ``window_px`` pixels of the layout's pitch around the focus are computed. ``path="radial"``
+    ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"``
     searches with a strip through the centre and the ring propagator instead of the whole plane; it
     needs a circular aperture and a ring layout, and scores always use the plane.
     """
@@ -83,7 +83,7 @@ class ImagingSettings(Record):
         return self
 
 
-# 36 mm of display at 140 mm are 102.9 µm at 400 µm. An object has a dark border of an eighth on each side.
+# A display of 36 mm at 140 mm is 102.9 µm wide at 400 µm. Objects have a dark border of 1/8 on each side.
 PAPER_IMAGING = ImagingSettings(pixel_px=10, object_px=137)
 
 
@@ -98,7 +98,7 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # A draw of a lens costs a whole plane, as much as ten steps of its search along a radius.
+    # A draw computes a whole plane, which costs as much as ten steps of the search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
@@ -110,16 +110,16 @@ def lens_settings(
     """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings.
 
     ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square
-    aperture; that it has rings is from the published code, the text does not say. Its display, 36 mm wide
-    at 140 mm, is 102.9 µm wide on the sensor: 103 pixels of 1 µm, and as wide a PSF window. The pixel is
-    ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings
-    as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25,
-    smooth L1, read and photon noise, their wavelength and index step, objects as wide as the lens. What
-    is not reproduced of the published code is in docs/from_the_authors_code.md. ``default``: a circular
-    aperture, the Fresnel phase as start, and the ring path in the search.
+    aperture; the rings are from the published code, as the text does not mention them. Its display, 36 mm
+    wide at 140 mm, is 102.9 µm wide on the sensor: 103 pixels of 1 µm, and as wide a PSF window. The pixel is
+    ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings as wide
+    as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25, smooth L1,
+    read and photon noise, their wavelength and index step, objects as wide as the lens. For what is not
+    reproduced of the published code, see docs/from_the_authors_code.md. ``default``: a circular aperture, the
+    Fresnel phase as start, and the ring path in the search.
 
     Args:
-        task: focus light, or image and deconvolve; ``task`` among the changes replaces it.
+        task: focus light, or image and deconvolve; a ``task`` in the changes replaces it.
         variant, changes: as for ``hologram_settings``.
 
     Raises:

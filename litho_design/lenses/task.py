@@ -1,4 +1,4 @@
-"""Lenses as tasks: from levels on the pixels to a loss, a score and what is kept."""
+"""Lenses as tasks: from levels on the pixels to a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
-# The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
+# The same noise in every iteration, so that the search compares layouts, not noise; scores draw their own.
 _DESIGN_NOISE_SEED = 0
 _PLANE_NOTE = (
     "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
@@ -44,13 +44,13 @@ _PLANE_NOTE = (
 
 
 def lens_task(settings: LensSettings, printer: Printer, **given: Any) -> LensTask:
-    """The task that ``settings.task`` names, with arguments and errors of ``LensTask``."""
+    """The task that ``settings.task`` names, with the arguments and errors of ``LensTask``."""
     kind = DirectLensTask if settings.task == "direct" else ComputationalLensTask
     return kind(settings, printer, **given)
 
 
 class LensTask(Task):
-    """A lens, ready for ``run_design``: what direct and computational ones share.
+    """A lens, ready for ``run_design``: the common part of direct and computational lenses.
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
@@ -59,7 +59,7 @@ class LensTask(Task):
         inputs: pixels of the objects that are pictures, as ``with_objects`` gives them.
 
     Raises:
-        InputError: a radial search of a layout without rings or with a square aperture, a start for
+        InputError: a radial search of a layout without rings or with a square aperture, a start that is for
             holograms, an object without pixels, or spreads beyond the range of the propagator.
     """
 
@@ -105,11 +105,11 @@ class LensTask(Task):
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
 
     def make_bench(self, optics: Optics) -> LensBench:
-        """Light onto the focal window."""
+        """The bench from the element to the focal window."""
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Along a radius where layout and printers allow it, else the whole plane."""
+        """Along a radius if layout and printers allow it, otherwise on the whole plane."""
         if not self.radial:
             return self.make_bench(optics)
         if optics.element == "thick":
@@ -129,13 +129,13 @@ class LensTask(Task):
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels whose print is nearest to a perfect lens; on the CPU, where sums over rings repeat."""
+        """Levels whose print is nearest to a perfect lens; on the CPU, so that sums over rings repeat."""
         phase = fresnel_lens_phase(self.cells.cpu(), self.settings.layout.pitch_um, self.settings.optics)
         self.cells.to(self.printer.device)
         return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore | ImagingLensScore:
-        """Score of a print whose design expected ``expected_um``, or the same."""
+        """Score of a print whose design expected ``expected_um``, by default the same print."""
         expected = height_um if expected_um is None else expected_um
         return score_lens(self.settings, self.bench, height_um, expected, self.pictures)
 
@@ -205,7 +205,7 @@ class ComputationalLensTask(LensTask):
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
-    """A note where the PSF window is narrower than the focusing circle."""
+    """A note if the PSF window is narrower than the focusing circle."""
     # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
     window_um, enough_px = bench.window.size_um[0], math.ceil(2 * radius_um / bench.layout.pitch_um)
@@ -218,9 +218,9 @@ def _narrow_window(bench: LensBench) -> list[str]:
 
 
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
-    """Ring under each pixel of a strip: two central rows, rings 0 to the aperture, a halo all round.
+    """Ring of each pixel of a strip: two central rows, rings 0 to the aperture, a halo all round.
 
-    Beyond the last of the ``rings`` the strip goes on with that one.
+    Beyond the last of the ``rings`` the strip continues with it.
     """
     along = torch.arange(-halo_px, layout.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5
@@ -253,7 +253,7 @@ def _check(settings: LensSettings) -> None:
 
 
 def _check_outermost_zone(settings: LensSettings) -> None:
-    """Two cells draw a zone; the outermost of a lens is wavelength / sin(angle of the rim) wide."""
+    """Check that two cells fit into the outermost zone, which is wavelength / sin(angle of the rim) wide."""
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_px * layout.pitch_um / 2
     zone_um = optics.wavelength_um * math.hypot(radius_um, optics.distance_um) / radius_um

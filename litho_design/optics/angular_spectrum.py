@@ -13,7 +13,7 @@ from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import KernelPropagator, wrapped_order
 from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
 
-# 4096 pixels along both axes: half a gibibyte while the kernel is made.
+# Longest period, pixels along both axes; making the kernel takes half a gibibyte.
 _LONGEST_PERIOD = 4096
 
 
@@ -21,15 +21,15 @@ class ASMPropagator(KernelPropagator):
     """Carry a complex field to a parallel plane with the transfer function of free space.
 
     H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)); the root is complex, so evanescent waves decay
-    instead of becoming NaN. The period of the sampled H is as long as its steepest rays need not to come
-    back wrapped, up to 4096 pixels; frequencies whose rays are steeper than the period allows are removed
-    (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). Only the separations between the
-    two grids are kept of the kernel, so that padding costs nothing after construction. A negative distance
-    runs the propagating waves backwards and drops the evanescent ones.
+    instead of becoming NaN. The period of the sampled H is long enough, up to 4096 pixels, that its steepest
+    rays do not wrap around; frequencies whose rays are steeper than the period allows are removed (after
+    Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). The kernel is kept only at the separations
+    between the two grids, so padding costs nothing after construction. A negative distance runs the
+    propagating waves backwards and drops the evanescent ones.
 
-    Pixels above half a wavelength have a steepest ray, and the result is exact for waves within their band.
-    Below, rays up to the grazing one exist: 1 % of the wave of a rough element is missing or wrapped, and
-    ``RSPropagator`` is the better choice.
+    Pixels above half a wavelength limit the steepness of rays, and the result is exact for waves within their
+    band. With smaller pixels, rays up to grazing ones exist: 1 % of the wave of a rough element is missing or
+    wrapped, and ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of equal pitch; shape and origin are free.
@@ -64,7 +64,7 @@ class ASMPropagator(KernelPropagator):
 
 @dataclass(frozen=True)
 class SpectrumAxis:
-    """One axis: frequencies (cycles/µm), those kept, samples of the kernel in use, shift of the grids."""
+    """One axis: frequencies (cycles/µm), mask of the kept ones, samples of the kernel, shift of the grids."""
 
     frequency: Tensor
     inside: Tensor
@@ -72,7 +72,7 @@ class SpectrumAxis:
     start_um: float
 
     def part(self, which: slice) -> SpectrumAxis:
-        """Some of the frequencies."""
+        """The axis restricted to some of its frequencies."""
         return replace(self, frequency=self.frequency[which], inside=self.inside[which])
 
 
@@ -85,7 +85,7 @@ def spectrum_axes(
 
 
 def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
-    """What free space does to each frequency, complex128 (y, x); 0 where the period is too short for it."""
+    """Transfer function of free space, complex128 (y, x); 0 at frequencies too steep for the period."""
     fy, fx = y.frequency[:, None], x.frequency[None, :]
     band = y.inside[:, None] & x.inside[None, :]
     axial = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double()).sqrt()
@@ -109,8 +109,8 @@ def _axis_band(
     middle = start + (there - here) * pitch / 2
     cosine = (1 - (wavelength_um * frequency) ** 2).clamp(min=0).sqrt()
     ray_shift = distance_um * wavelength_um * frequency
-    # A ray comes back wrapped when it goes a period further than the far edge of the target.
+    # A ray wraps around if it travels a period beyond the far edge of the target.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
-    # At zero distance nothing moves, evanescent waves included.
+    # At zero distance nothing changes, not even evanescent waves.
     return SpectrumAxis(frequency, inside | (distance_um == 0), index % length, start)

@@ -1,4 +1,4 @@
-"""The far field: the focal plane of an ideal lens behind the element, where a place is an angle."""
+"""The far field: the focal plane of an ideal lens behind the element, where positions are angles."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from litho_data.foundation.grid import PixelGrid
 class FarFieldPropagator(nn.Module):
     """Carry a field to the focal plane of an ideal lens.
 
-    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx: the place p stands for a sine, p / f.
-    The sum is exact for any two grids, as a matrix for each axis, and pixels are squares (Goodman, Fourier
-    Optics, ch. 5).
+    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx: position p stands for the sine p / f. The sum is
+    exact for any two grids, as one matrix per axis, and pixels are squares (Goodman, Fourier Optics, ch. 5).
 
     Args:
         source, target: grids of the two planes, µm; any shapes and pitches.
         distance_um: focal length f.
 
     Raises:
-        InputError: an image wider than λ f / pitch, beyond which a sampled element repeats itself.
+        InputError: an image wider than λ f / pitch, beyond which the light of a sampled element repeats.
     """
 
     along_y: Tensor
@@ -50,7 +49,7 @@ class FarFieldPropagator(nn.Module):
                 torch.from_numpy(grid.y_um if axis == 0 else grid.x_um).double() for grid in (source, target)
             )
             phase = -2 * math.pi / scale * torch.outer(there, here)
-            # A pixel is a square, and sends less light to the side than a point.
+            # A pixel is a square and sends less light sideways than a point.
             square = torch.sinc(there * source.pitch_um[axis] / scale)[:, None].expand_as(phase)
             matrix = torch.polar(square * (source.pitch_um[axis] / math.sqrt(scale)), phase)
             self.register_buffer(name, matrix.to(dtype), persistent=False)

@@ -9,8 +9,8 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Steps of a block that the gradient computes again. Where all steps fit into the memory below they are kept
-# instead: some twenty values for each pixel and step.
+# Steps per block that the gradient computes again. If all steps fit into the memory below, they are kept
+# instead: about twenty values per pixel and step.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
@@ -18,7 +18,7 @@ _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 class Blur:
     """x -> psf * x on the object's frame, dark outside it; linear, without wrap-around.
 
-    The PSF has odd sides and its middle sample is the origin, so that nothing shifts.
+    The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
     Args:
         psf: real (k, k), any energy; its gradient is kept.
@@ -29,9 +29,9 @@ class Blur:
         rows, columns = psf.shape
         assert rows % 2 == columns % 2 == 1, "a PSF of odd sides has a middle sample"
         self._frame = frame
-        # Pixel i takes from j the PSF at i - j, and at i - j ± length. With a length of frame and half a PSF
-        # the latter lie beyond the PSF. The array also has to hold the PSF.
-        # Even: a real transform of odd length takes nearly twice as long.
+        # Pixel i gets from j the PSF at i - j and, wrapped, at i - j ± length. If the length is that of frame
+        # plus half a PSF, the wrapped samples lie beyond the PSF. The array must also hold the PSF. The
+        # length is even, because a real transform of odd length takes nearly twice as long.
         lengths = (max(n + k // 2, k) for n, k in zip(frame, (rows, columns), strict=True))
         self._size = [2 * fast_length(-(-length // 2)) for length in lengths]
         middle_first = torch.nn.functional.pad(psf, (0, self._size[1] - columns, 0, self._size[0] - rows))
@@ -60,17 +60,17 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
 def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tensor:
     """Estimate the object behind a recorded image.
 
-    e <- e * H^T (b / H e) / (H^T 1), from a flat start of the right flux (Richardson 1972, Lucy
-    1974). The division by H^T 1 makes it right at the borders and for a PSF of any energy: the
-    estimate approaches the object itself, and sum(H e) = sum(b) after every step.
+    e <- e * H^T (b / H e) / (H^T 1), from a flat start of the right flux (Richardson 1972, Lucy 1974). The
+    division by H^T 1 makes the result correct at the borders and for a PSF of any energy: the estimate
+    approaches the object itself, and sum(H e) = sum(b) after every step.
 
     Args:
         recorded: image (..., ny, nx); negative values (read noise) count as dark.
         psf: real (k, k) of odd sides, on the same pixels.
 
     Returns:
-        Estimate (..., ny, nx); gradients flow to both arguments. For large images the way back computes the
-        steps again, block by block, so that memory does not grow with ``iterations``.
+        Estimate (..., ny, nx); gradients flow to both arguments. For large images the gradient computes the
+        steps again, block by block, so memory does not grow with ``iterations``.
     """
     blur = Blur(psf, (int(recorded.shape[-2]), int(recorded.shape[-1])))
     seen = recorded.clamp(min=_DARKEST)

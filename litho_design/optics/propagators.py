@@ -1,4 +1,4 @@
-"""The propagator of a scene: the one that is valid at its distance, or the one that is asked for."""
+"""The propagator of a scene: one that is valid at its distance, or the requested one."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def make_propagator(
 ) -> Propagator:
     """Carry waves from ``source`` to ``target`` in ``optics``.
 
-    ``auto`` takes the Rayleigh-Sommerfeld sum wherever its sampled kernel is not aliased, and the angular
-    spectrum below that distance, where its own period is long enough without further padding. ``far-field``
-    takes the distance as the focal length of an ideal lens.
+    ``auto`` takes the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter distances it
+    takes the angular spectrum, whose period is long enough there without further padding. ``far-field`` takes
+    the distance as the focal length of an ideal lens.
 
     Raises:
-        InputError: a distance below the sampling limit where ``rayleigh-sommerfeld`` is asked for, or unequal
+        InputError: a distance below the sampling limit if ``rayleigh-sommerfeld`` is requested, or unequal
             pitches for the angular spectrum.
     """
     kind: type[Propagator] = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
@@ -34,6 +34,6 @@ def make_propagator(
 
 
 def takes_spectrum(source: PixelGrid, target: PixelGrid, optics: Optics) -> bool:
-    """Whether the angular spectrum carries the wave, by request or because the sum would be aliased."""
+    """Whether to use the angular spectrum, by request or because the sum would be aliased."""
     near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
     return optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)

@@ -17,8 +17,8 @@ class RadialPropagator(nn.Module):
     """Carry a field of concentric rings to points at given radii of a parallel plane.
 
     U(p) = sum over rings of u times the integral of h over the ring, with h as in ``RSPropagator``.
-    Each ring is integrated with two Gauss-Legendre nodes across and the midpoint rule around, whose
-    error on a periodic integrand falls exponentially once the phase is resolved.
+    Each ring is integrated with two Gauss-Legendre nodes across and the midpoint rule around; the error of
+    the latter on a periodic integrand falls exponentially once the phase is resolved.
 
     Args:
         rings: number of rings; ring i covers radii [i, i + 1) * ring_width_um.

@@ -22,8 +22,8 @@ class RSPropagator(KernelPropagator):
     U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with
     h = z / (2 pi r^2) (1/r - j k) exp(j k r), r^2 = x^2 + y^2 + z^2, k = 2 pi / wavelength
     (time convention in which exp(+j k r) runs outwards; Goodman, Fourier Optics, ch. 3).
-    The sum is exact: the kernel is centred and spans all separations. Unequal pitches stand in a ratio of
-    small integers, and the kernel lies on the coarsest pixels that divide both.
+    The sum is exact: the kernel is centred and spans all separations. Unequal pitches must have a ratio of
+    small integers; the kernel then lies on the coarsest pixels that divide both.
 
     Args:
         source, target: grids of the two planes, origin and pitch in µm.
@@ -66,7 +66,7 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Into how many equal parts the first and the second pitch fall; None where there are too many."""
+    """Numbers of equal parts that divide the first and the second pitch; None if they are too many."""
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:
         return None

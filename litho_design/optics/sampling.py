@@ -56,7 +56,7 @@ def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wav
 
 def fast_length(length: int) -> int:
     """The next size for which the FFT is fast (factors 2, 3 and 5 only)."""
-    from scipy.fft import next_fast_len  # a tenth of a second that the command line need not wait
+    from scipy.fft import next_fast_len  # imported late to save the command line a tenth of a second
 
     found: int = next_fast_len(length, real=True)
     return found

@@ -1,4 +1,4 @@
-"""Stroke of a print: how much light its staircase of levels can send into a diffraction order."""
+"""Stroke of a print: the share of light that its staircase of levels can send into a diffraction order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels as one period of a blaze; None where nothing reaches a full wave."""
+    """Printed heights of the levels as one period of a blaze; None for figures that need a full wave."""
 
     printed_height_um: list[float]
     stroke_um: float

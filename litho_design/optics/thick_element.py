@@ -14,18 +14,18 @@ _SLICES_PER_WAVELENGTH = 20
 def wave_through_relief(
     field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
 ) -> Tensor:
-    """The wave above a relief, of the wave at its foot, with the phase of a thin element kept out of it.
+    """The wave behind a relief from the wave at its foot, carried back to the foot as for a thin element.
 
-    In every slice the wave is carried on by the angular spectrum twice, in the resist and in air, and each
-    place takes the wave of the medium that is there (Brenner and Singer 1993, doi:10.1364/AO.32.004984); a
-    pixel that the surface cuts takes both by their share, so that gradients flow. Reflection is that of
-    normal incidence, once: (n - 1)^2 / (n + 1)^2 is lost. The result is carried back through air to the
-    foot, where a thin element stands. Periodic beyond the borders.
+    In every slice the wave is propagated by the angular spectrum twice, in the resist and in air, and each
+    pixel takes the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the
+    surface cuts mixes both by their shares, so that gradients flow. One reflection at normal incidence is
+    included: (n - 1)^2 / (n + 1)^2 is lost. The result is propagated back through air to the foot, the plane
+    of a thin element. The field is periodic beyond the borders.
 
     Args:
         field: complex (..., ny, nx) at the foot of the relief, inside the resist.
         height_um: real (..., ny, nx), not below 0, µm.
-        index: of the resist; above the relief is air.
+        index: refractive index of the resist; above the relief is air.
     """
     highest_um = float(height_um.detach().max())
     count = max(1, math.ceil(highest_um * _SLICES_PER_WAVELENGTH / wavelength_um))
@@ -36,7 +36,7 @@ def wave_through_relief(
 
     def carried(n: float, distance_um: float) -> Tensor:
         axial = torch.complex((n / wavelength_um) ** 2 - squared, torch.zeros_like(squared)).sqrt()
-        # Evanescent waves decay forwards, and are dropped on the way back.
+        # Evanescent waves decay on the way forward and are dropped on the way back.
         kept = torch.ones_like(squared) if distance_um > 0 else (axial.imag == 0).double()
         return (torch.exp(2j * math.pi * distance_um * axial) * kept).to(field.dtype)
 

@@ -11,9 +11,9 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
-# Shorter or longer is no light, but a number of metres or nanometres.
+# A shorter or longer wavelength is probably a number in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
-# Beyond the element as far as light spreads within the height of a relief.
+# Border around the element: how far light spreads within the height of a relief.
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:
@@ -104,23 +104,23 @@ def element_field(
     *,
     pixels: int | None = None,
 ) -> Tensor:
-    """The wave just behind a phase element lit by a plane wave of unit power.
+    """The wave just behind a phase element that is lit by a plane wave of unit power.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
-    elsewhere, times a Gaussian beam and the wave of a near point where the optics have them, scaled so that
-    sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area are shares of the incident
-    power. A thick element is what ``wave_through_relief`` makes of it, in air.
+    elsewhere, times a Gaussian beam and the wave of a near point if the optics have them, scaled so that sum
+    |u|^2 dy dx = 1. So the sum of intensities over any window, times its pixel area, is a share of the
+    incident power. For a thick element, ``wave_through_relief`` replaces the phase, in air.
 
     Args:
         height_um: real (..., ny, nx), µm.
         grid: geometry of ``height_um``.
         aperture: optional real mask (ny, nx) in [0, 1].
-        pixels: of the whole element, where ``grid`` is a part of it.
+        pixels: number of pixels of the whole element, if ``grid`` is a part of it.
 
     Returns:
         complex (..., ny, nx), 1/µm.
     """
-    import torch  # the command line reads `Optics` without it
+    import torch  # imported late, because the command line reads `Optics` without it
 
     phase = height_um * (2 * math.pi / optics.wave_height_um)
     if optics.incidence_x or optics.incidence_y or optics.source_distance_um or optics.beam_um:
@@ -146,12 +146,12 @@ def element_field(
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """The wave behind a thick element in air lit by ``field`` (..., ny, nx), dark around it."""
+    """The wave behind a thick element in air that is lit by ``field`` (..., ny, nx), dark around it."""
     import torch
 
     from litho_design.optics.thick_element import wave_through_relief
 
-    # Dark beyond the borders, so that what leaves on one side does not come in on the other.
+    # Dark beyond the borders, so that light that leaves on one side does not enter on the other.
     border = (math.ceil(_BORDER_UM / pitch_um),) * 4
     dark = torch.nn.functional.pad(field, border)
     relief = torch.nn.functional.pad(height_um - height_um.amin(), border)

@@ -20,7 +20,7 @@ _KIB_PER_GIB = 1 << 20
 class Budget(Record):
     """Cost of one iteration, measured on a trial iteration that changes nothing.
 
-    ``seconds_after``: of what comes after the search, scores and report.
+    ``seconds_after``: time of scores and report after the search.
     """
 
     seconds_per_iteration: float
@@ -29,7 +29,7 @@ class Budget(Record):
     seconds_after: float = 0.0
 
     def total_seconds(self, search: SearchSettings, done: int = 0) -> float:
-        """Expected time of the search after ``done`` iterations, of its polish, and of what comes after."""
+        """Expected time of the search after ``done`` iterations, of its polish, and of scores and report."""
         left = search.iterations - done
         evaluations = left / search.evaluate_every
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
@@ -51,7 +51,7 @@ def measure_budget(
     search: SearchSettings,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Budget:
-    """Time one iteration with gradient and one without, on the parameters as they are."""
+    """Time one iteration with gradient and one without, at the present parameters."""
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()
@@ -72,7 +72,7 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Highest memory so far: of the device on CUDA, of the process elsewhere."""
+    """Highest memory so far: of the device for CUDA, otherwise of the process."""
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

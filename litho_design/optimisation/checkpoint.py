@@ -1,4 +1,4 @@
-"""What an interrupted search leaves in its folder, and how it goes on from there."""
+"""The checkpoint that an interrupted search leaves in its folder and resumes from."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 
-# What torch raises for a damaged file depends on the place of the damage.
+# The error that torch raises for a damaged file depends on the position of the damage.
 _DAMAGED = (
     RuntimeError,
     pickle.UnpicklingError,
@@ -37,13 +37,13 @@ class Stateful(Protocol):
 
 @dataclass
 class SearchState:
-    """What a search has found so far; all that a resumed one needs beside its settings and stateful parts."""
+    """What a search has found so far: all that resuming needs besides its settings and stateful parts."""
 
     iteration: int = 0
     best_loss: float = math.inf
     best_levels: Tensor | None = None
     history: list[dict[str, float]] = field(default_factory=list)
-    # Of the search, in runs that were interrupted.
+    # Time of the search in interrupted runs.
     earlier_seconds: float = 0.0
 
 
@@ -61,7 +61,7 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Stateful], device: torch.device
 ) -> SearchState:
-    """Load the parts from a checkpoint, in place, and return its state, on ``device``.
+    """Load the parts in place from a checkpoint, and return its state on ``device``.
 
     Raises:
         InputError: a checkpoint of another task, or a damaged file.
@@ -83,7 +83,7 @@ def load_checkpoint(
 
 
 def checkpoint_path(folder: Path, part: str = "") -> Path:
-    """Where a search in ``folder`` keeps its state; ``part`` is its part of a shared search."""
+    """File in which a search in ``folder`` keeps its state; ``part`` is its part of a shared search."""
     return folder / f"checkpoint{part}.pt"
 
 
@@ -99,7 +99,7 @@ def remove_checkpoint(folder: Path, part: str = "") -> None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """A checkpoint, loaded to the CPU, so that a full GPU is not taken for a damaged file."""
+    """A checkpoint, loaded to the CPU first, so that a full GPU does not look like a damaged file."""
     stored = path.read_bytes()
     try:
         content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")

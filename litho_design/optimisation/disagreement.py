@@ -1,4 +1,4 @@
-"""How far several models are apart about the print of one layout."""
+"""How much several models disagree about the print of one layout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_design.printers.printer import Printer, PrinterRecord
 
-# (1e-6 µm)^2: keeps the root differentiable where all models agree, and is far below any height.
+# (1e-6 µm)^2, far below any height, keeps the root differentiable where all models agree.
 _SMALLEST_VARIANCE_UM2 = 1e-12
 
 
@@ -24,13 +24,13 @@ class EnsembleRecord(Record):
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """RMS over the area of the standard deviation between models, µm; differentiable.
+    """RMS over the area of the standard deviation among models, µm; differentiable.
 
     A constant height is only a constant phase, so the mean of every print is subtracted first.
 
     Args:
         heights_um: prints of one layout by k models, (k, ...).
-        area: area that each height covers, (...), in any unit, as for rings; None for pixels.
+        area: area that each height covers, (...), in any unit, for rings; None for pixels.
     """
     flat = heights_um.flatten(1)
     share = torch.ones_like(flat[0]) if area is None else area.flatten()

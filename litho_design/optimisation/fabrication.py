@@ -1,4 +1,4 @@
-"""What a printer can make, as a penalty in the loss: steps, features, levels that its model learned from."""
+"""Limits of the printer as a penalty in the loss: steps, fine features, levels rare in training layouts."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from litho_design.printers.layout import LayoutSettings
 
 
-# Of steps and features beside the loss.
+# Weight of the penalties on steps and features.
 _WEIGHT = 3.0
 
 
 class Fabrication(Record):
-    """Penalties on a layout beside the loss of its light.
+    """Penalties on a layout in addition to the loss of its light.
 
-    loss + 3 * (excess of steps + height of fine features) + inside_weight * ``outside``. The first is
-    the mean of (step - max_step_levels)^2 over neighbouring pixels, where positive; the second what a grey
-    opening and closing by ``min_feature_um`` take away along rows and columns, or along a radius of rings:
-    ridges and grooves narrower than that; both relative to the highest level.
+    loss + 3 * (excess of steps + height of fine features) + inside_weight * ``outside``. The first penalty is
+    the mean of (step - max_step_levels)^2 over neighbouring pixels whose step exceeds the limit. The second
+    is what a grey opening and closing by ``min_feature_um`` remove along rows and columns, or along a radius
+    of rings: ridges and grooves narrower than that. Both are relative to the highest level.
     """
 
     max_step_levels: int = setting(
@@ -46,7 +46,7 @@ class Fabrication(Record):
 def fabrication_penalty(
     level: Tensor, settings: Fabrication, layout: LayoutSettings, card: Mapping[str, Any]
 ) -> Tensor | None:
-    """The penalty on levels (1, 1, size, size), whole or real; None where nothing is asked for."""
+    """The penalty on levels (1, 1, size, size), whole or real; None without any limit."""
     terms = []
     if settings.max_step_levels:
         terms.append(_WEIGHT * _step_excess(level, settings.max_step_levels, layout.levels))
@@ -60,11 +60,12 @@ def fabrication_penalty(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """How far a layout reaches beyond twice the tails of the training layouts of a model, in levels.
+    """By how much a layout exceeds twice the tails of a model's training layouts, in levels.
 
-    The sum over k of the share of pixels at level k or lower, at k or higher, and of neighbours with steps
-    of k or more, each as far as it exceeds twice that of the training layouts; 0 where a card has none.
-    A sum of tails, unlike a sum of shares, pulls in a pixel that is several levels outside.
+    For every k, three shares are compared: of pixels at level k or lower, of pixels at k or higher, and of
+    neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
+    training layouts; 0 if the card has none. A sum of tails, unlike a sum of shares, also attracts a pixel
+    that is several levels outside.
     """
     total = level.new_zeros(())
     trained, trained_steps = (
@@ -93,18 +94,18 @@ def _step_excess(level: Tensor, allowed: int, levels: int) -> Tensor:
 
 
 def _fine_features(level: Tensor, width: int, levels: int) -> Tensor:
-    """Mean height that opening and closing by ``width`` pixels take away along rows and columns."""
+    """Mean height that opening and closing by ``width`` pixels remove along rows and columns."""
     lines = [level] if level.shape[-2] == 1 else [level, level.transpose(-1, -2)]
     taken = [(_opened(one, width) - one).abs() + (one + _opened(-one, width)).abs() for one in lines]
     return sum((one.mean() for one in taken), level.new_zeros(())) / (levels - 1)
 
 
 def _opened(rows: Tensor, width: int) -> Tensor:
-    """Grey opening along x: the highest of the lowest values of all stretches of ``width`` pixels here."""
+    """Grey opening along x: the highest of the minima of all runs of ``width`` pixels around a pixel."""
     import torch.nn.functional as F
 
     flat = rows.flatten(0, -2)[:, None]
-    # Beyond the border everything continues: a feature there may do so in a neighbour.
+    # Values continue beyond the border, because a feature there may continue in a neighbour.
     padded = F.pad(flat, (width - 1, width - 1), mode="replicate")
     lowest = -F.max_pool1d(-padded, width, 1)
     return F.max_pool1d(lowest, width, 1).reshape(rows.shape)

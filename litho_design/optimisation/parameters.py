@@ -1,4 +1,4 @@
-"""Free parameters and the layout that they stand for: cells or rings, Gumbel-Softmax or rounded heights."""
+"""Free parameters and the layout that they describe: cells or rings, Gumbel-Softmax or rounded heights."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from litho_design.optimisation.process_window import blurred
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
-# A learning rate of 1 moves by one level of 13, and by as much of the height where there are more or fewer.
+# A learning rate of 1 moves by one of 13 levels, and by the same share of the height with more or fewer
+# levels.
 _RATE_STEPS = 12
-# One level: the neighbours of the starting level can be reached from the first step.
+# Of one level, so that neighbours of the starting level can be reached from the first step.
 _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
     """Spread one value per free cell over the pixels of the layout, and average back.
 
-    With ``rows`` it is the map of these rows of pixels only; ``own`` takes their cells out of those of all.
+    With ``rows`` it maps only these rows of pixels; ``own`` selects their cells from all cells.
     """
 
     ring: Tensor
@@ -43,7 +44,7 @@ class CellMap(nn.Module):
             self.cells = (len(rows) // self.cell_px, self.cells[-1])
 
     def own(self, values: Tensor) -> Tensor:
-        """Of one value per cell of the whole layout those of the own rows."""
+        """From one value per cell of the whole layout, those of the own rows."""
         return values[self._own]
 
     def forward(self, values: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ class GumbelLevels(nn.Module):
     Jang, Gu and Poole 2017, arXiv:1611.01144; a sample is the expected level under the sampled weights.
     """
 
-    # Of a learning rate: logits have no range.
+    # Factor on the learning rate, as logits have no range.
     rate_unit = 1.0
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -105,7 +106,7 @@ class GumbelLevels(nn.Module):
         self.logits.copy_(torch.randn(self.logits.shape, generator=generator))
 
     def project(self) -> None:
-        """Logits have no range: nothing to clamp."""
+        """Do nothing, because logits have no range to clamp to."""
 
 
 class DirectLevels(nn.Module):
@@ -123,7 +124,7 @@ class DirectLevels(nn.Module):
         self.filter_cells = layout.cell_filter_um / layout.cell_um
 
     def sample(self, temperature: float = 1.0, seed: int = 0, *, hard: bool = False) -> Tensor:
-        """Levels on the pixels, float (1, 1, size, size); nothing here is random."""
+        """Levels on the pixels, float (1, 1, size, size); this sample is not random."""
         free, kept = self._filtered(), self._kept()
         level = free + ((kept.round() if hard else kept) - free).detach()
         return self.cells(level)[None, None]
@@ -150,7 +151,7 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Levels within the range, which an optimiser that does not project may have left."""
+        """Levels clamped to the range, which an optimiser may leave if it does not call ``project``."""
         return self._filtered().clamp(0, self.levels - 1)
 
     def _filtered(self) -> Tensor:
@@ -163,16 +164,16 @@ Parametrisation = GumbelLevels | DirectLevels
 def make_parametrisation(
     layout: LayoutSettings, search: SearchSettings, cells: CellMap | None = None
 ) -> Parametrisation:
-    """The free parameters named by ``search.parametrisation``; ``cells`` of a part of the layout.
+    """The free parameters named by ``search.parametrisation``; ``cells`` may cover a part of the layout.
 
     Raises:
-        InputError: a filter over the cells of a distribution over levels.
+        InputError: a filter over cells together with distributions over levels.
     """
     if search.parametrisation == "direct":
         return DirectLevels(layout, cells)
     if layout.cell_filter_um:
         raise InputError(
-            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions have no neighbours"
+            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions cannot be filtered"
         )
     return GumbelLevels(layout, cells)
 

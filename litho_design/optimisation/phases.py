@@ -1,4 +1,4 @@
-"""Wanted phases and the printed levels nearest to them: Gerchberg-Saxton for images, Fresnel for lenses."""
+"""Wanted phases (Gerchberg-Saxton for images, Fresnel for lenses) and the printed levels nearest to them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import CellMap
 
-# Amplitude, the element's being 1, below which a wave has no phase.
+# Amplitude, relative to that of the element, below which a wave has no phase.
 _DARK = 1e-12
-# From random phases of the whole circle every sixth pair of neighbouring cells ends more than half a wave
-# apart, which a print rounds off and a search does not mend. A plate that is nearly flat ends with a third
-# fewer such steps, and still leaves every seed its own way.
+# Starting from random phases on the whole circle, one in six pairs of neighbouring cells ends more than half
+# a wave apart, a step that printing rounds off and the search does not repair. A nearly flat start ends with
+# a third fewer such steps, and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -34,24 +34,24 @@ def gerchberg_saxton(
 ) -> tuple[Tensor, list[float]]:
     """A phase per cell whose propagated amplitude approaches sqrt(target).
 
-    Each step replaces the propagated amplitude inside the output window, keeps the wave outside it,
-    sends the correction back with the adjoint and projects on what the element can do: u' = Pi(u +
-    P^H (a exp(j arg P u) - P u)). Because the norm of P is at most one, this majorises the squared
-    amplitude error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form
-    (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is
-    missing; it trades that guarantee for uniformity. The first phase is half a turn, the middle of levels
-    that make a full wave, and up to a radian more or less.
+    Each step replaces the propagated amplitude inside the output window, keeps the wave outside it, sends the
+    correction back with the adjoint and projects the result on the phases of the element: u' = Pi(u + P^H (a
+    exp(j arg P u) - P u)). Because the norm of P is at most one, this majorises the squared amplitude error,
+    which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al. 2007,
+    doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing; it trades that guarantee for
+    uniformity. The first phase is half a turn, the middle of levels that make a full wave, and up to a radian
+    more or less.
 
     Args:
         propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
         target: wanted intensity (size, size) in [0, 1].
         cells: the element's free cells.
-        counted: pixels whose amplitude is wanted, bool (size, size); elsewhere the wave is kept as it is. The
-            wanted amplitude then follows the light that is there.
+        counted: pixels whose amplitude is prescribed, bool (size, size); elsewhere the wave is kept as it is.
+            The wanted amplitude is then scaled to the light on these pixels.
         level_phase: printed phase of each level, radian (levels,); if given, the second half of the
             iterations projects on these phases instead of on the whole circle.
-        total: sum over the pixels of the element, of which cells and target may be a part; None where they
-            are all of it.
+        total: sums over the pixels of the whole element, if cells and target are a part of it; otherwise
+            None.
 
     Returns:
         Phase per cell, radian, and the amplitude error sqrt(sum (|P u| - a)^2) before each step.
@@ -98,12 +98,12 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
     y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
     radius = (x**2 + y**2 + optics.distance_um**2).sqrt()
     phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius)
-    # Cells average the wave, not the phase: a mean over a wrapped phase means nothing.
+    # Cells average the wave, not the phase, because the mean of a wrapped phase means nothing.
     return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Levels nearest to a lens's ``phase``, after the constant phase shift that loses the least light.
+    """Levels nearest to a lens's ``phase`` after the constant phase shift that loses the least light.
 
     A stroke below one wave leaves a gap in the phase circle, and a constant phase moves that gap. The mean of
     exp(j error) over the cells is the amplitude at the focus.

@@ -11,7 +11,7 @@ from litho_data.commands.progress import progress
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import Objective
 
-# Up to this many cells every single change is tried; beyond it the gradient proposes.
+# Up to this many cells, every single change is tried; with more, the gradient proposes changes.
 _EXHAUSTIVE_CELLS = 64
 
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# A print passes if no figure in dB is further below the print as modelled, and if every other one keeps this
-# share of it; an error may be its inverse.
+# A print passes if no figure in dB falls further below that of the print as modelled, every other figure
+# keeps this share of it, and no error grows by more than the inverse.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM, _STITCH_STREAM = 1, 3
 _IN_PLACE = Stitching()
@@ -31,11 +31,11 @@ _SPREADS = (
 
 
 class ProcessWindow(Record):
-    """Spread of prints and optics, and how a search weighs it.
+    """Spread of prints and optics, and its weight in a search.
 
     ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
-    blur. A search with ``samples`` above 0 minimises the mean loss of the worst ``tail`` share of as many
-    draws, which are the same in every iteration. The defaults are a guess: replace them by the spreads of
+    blur. With ``samples`` above 0, a search minimises the mean loss of the worst ``tail`` share of that many
+    draws, which are the same in every iteration. The defaults are a guess; replace them by the spreads of
     your printer. The fields of one measured data set vary by 13 % in gain, including the scale of the
     microscope.
     """
@@ -74,7 +74,7 @@ def spreads(window: ProcessWindow) -> list[str]:
 
 @dataclass(frozen=True)
 class Draw:
-    """One print, in one set of optics."""
+    """One random print in one random set of optics."""
 
     gain: float
     offset_um: float
@@ -86,9 +86,9 @@ class Draw:
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
         """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
 
-        A uniform offset changes no image, only the scores of heights.
-        Rings are blurred along the radius only, which is exact where they are much wider than the blur
-        or far from the centre. Of maps only, write fields are put off their places then.
+        A uniform offset changes no image, only the scores of heights. Rings are blurred along the radius
+        only, which is exact if they are much wider than the blur or far from the centre. For maps only, write
+        fields are then displaced.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -106,7 +106,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    # Five numbers a draw: a further spread needs a stream of its own, or all older draws change.
+    # Five numbers per draw; a further spread needs its own stream, or all older draws would change.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -141,7 +141,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             hint="lower --wavelength-sd-um",
         )
     limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
-    # The angular spectrum has no limit, but an image plane behind the element stays behind it.
+    # The angular spectrum has no limit, but an image plane behind the element must stay behind it.
     if optics.propagation != "rayleigh-sommerfeld":
         limit_um = min(draw.optics.wavelength_um for draw in drawn)
     if optics.distance_um < limit_um:
@@ -158,7 +158,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 class Yield(Record):
-    """Share of random prints that pass, with its 95 % interval (Wilson), by which figures."""
+    """Share of random prints that pass, its 95 % interval (Wilson), and the figures that decide."""
 
     draws: int
     passed: int
@@ -172,7 +172,7 @@ def measure_yield(
     modelled: Mapping[str, float],
     errors: Collection[str] = (),
 ) -> Yield:
-    """How many drawn prints pass: all figures that they share with the print as modelled stay close to it.
+    """How many drawn prints pass, that is, keep all figures shared with the print as modelled close to it.
 
     Args:
         errors: figures that are better when lower.
@@ -213,7 +213,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
         store: a ``litho_data`` store with at least three scans outside its lock box.
 
     Raises:
-        InputError: fewer scans, or layouts without structure.
+        InputError: too few scans, or layouts without structure.
     """
     locked = store.locked_ids
     fits = []
@@ -226,8 +226,8 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     if len(fits) < 3:
         raise InputError(
             "process window",
-            got=f"{len(fits)} scans with structure, {len(locked)} locked ones left out",
-            wanted="three at least",
+            got=f"{len(fits)} scans with structure, {len(locked)} locked scans left out",
+            wanted="at least three",
         )
     gain, offset = np.array(fits).T
     return window.model_copy(
@@ -240,7 +240,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
 
 def blurred(height: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian blur of a map with mirrored borders; rings are mirrored at the centre, level at the edge."""
+    """Gaussian blur of a map with mirrored borders, or of rings, mirrored at the centre and level outside."""
     import torch
     import torch.nn.functional as F
 

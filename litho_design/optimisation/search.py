@@ -1,4 +1,4 @@
-"""The search loop of every task: free parameters in, printable levels out; it can resume at any step."""
+"""The search loop of every task: free parameters in, printable levels out; it can resume from checkpoints."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def search_layout(
     Args:
         parameters: a started parametrisation, changed in place.
         objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
-        folder: where ``checkpoint.pt`` is written and looked for; None to run without.
+        folder: folder of ``checkpoint.pt``; None to run without a checkpoint.
         fingerprint: identifies the task; a checkpoint of another task is refused.
         part: which part of a shared search this is, in the name of its checkpoint.
 
     Returns:
-        The state with the argmax levels kept (``best_levels``, per cell) and the history, one
-        record per evaluated iteration: loss of the sample and of the argmax layout.
+        The state with the kept argmax levels (``best_levels``, per cell), and the history: one record per
+        evaluated iteration with the loss of the sample and of the argmax layout.
 
     Raises:
         InputError: the checkpoint in ``folder`` is of another task, or the loss is not finite.
@@ -78,7 +78,7 @@ def _step(
     settings: SearchSettings,
     iteration: int,
 ) -> float:
-    # The noise follows from seed and iteration, so that a resumed run draws the same numbers.
+    # The noise depends on seed and iteration only, so that a resumed run draws the same numbers.
     seed = settings.seed * 1_000_003 + iteration
     optimiser.zero_grad(set_to_none=True)
     level = parameters.sample(settings.temperature(iteration), seed)
@@ -115,10 +115,10 @@ def _evaluate(
 
 
 def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) -> StepLR | ReduceLROnPlateau:
-    """What lowers the rate of ``optimiser`` as the settings say; its state goes into the checkpoint."""
+    """The scheduler that lowers the rate of ``optimiser`` by the settings; the checkpoint holds its state."""
     factor, iterations = settings.rate_factor, settings.rate_iterations
     if settings.rate_schedule == "plateau":
-        # Relative to the loss, PyTorch's own, a threshold is none where a loss is negative.
+        # PyTorch's default, a threshold relative to the loss, does not work for a negative loss.
         return ReduceLROnPlateau(
             optimiser, factor=factor, patience=iterations, threshold=PROGRESS, threshold_mode="abs"
         )
@@ -126,7 +126,7 @@ def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) ->
 
 
 def lower_rate(schedule: StepLR | ReduceLROnPlateau, loss: float) -> None:
-    """An iteration has been made, and its sample had this loss."""
+    """Tell the scheduler that an iteration is done and that its sample had this loss."""
     if isinstance(schedule, ReduceLROnPlateau):
         schedule.step(loss)
     else:

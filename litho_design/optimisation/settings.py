@@ -1,4 +1,4 @@
-"""How a layout is searched."""
+"""Settings of the search for a layout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.printers.layout import LayoutSettings
 
-# What a loss has to fall by, so that it counts.
+# Smallest fall of a loss that counts as progress.
 PROGRESS = 1e-4
 
 Variant = Literal["default", "paper", "authors"]
@@ -24,7 +24,7 @@ StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 
 class SearchSettings(Record):
-    """How the layout is searched; every choice the paper leaves open is a recorded setting."""
+    """How the layout is searched; every choice that the paper leaves open is a recorded setting."""
 
     parametrisation: Literal["gumbel", "direct"] = setting(
         "direct",
@@ -84,14 +84,14 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """With further models in the search, the loss is the worst of them + weight * disagreement in waves."""
+    """With further models in the search, the loss is their worst loss + weight * disagreement in waves."""
 
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )
 
 
-# Settings that designs had which are to stay readable: choices that nobody made.
+# Former settings, which nobody changed, of designs that must stay readable.
 _GONE = (
     *("search.start_iterations", "search.start_jitter_levels", "search.hard_from", "ensemble.risk"),
     *("window.risk", "window.weight", "window.pass_drop_db", "window.pass_share", "fabrication.weight"),
@@ -100,7 +100,7 @@ _GONE = (
 
 
 class DesignSettings(Record):
-    """What the settings of every design hold."""
+    """The settings that every design has."""
 
     variant: Variant = setting(
         "default",

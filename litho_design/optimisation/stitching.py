@@ -1,4 +1,4 @@
-"""Prints that are made of write fields, each of which lies a little off its place."""
+"""Prints made of write fields that are each displaced a little."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Stitching(Record):
-    """Write fields, counted from the corner of the element, and how far they lie off their places.
+    """Write fields, counted from the corner of the element, and the spread of their displacements.
 
     ``sigma_um`` is the standard deviation along each axis; none by default.
     """
@@ -30,12 +30,12 @@ class Stitching(Record):
     )  # fmt: skip
 
     def offsets_um(self, size_px: int, pitch_um: float, seed: list[int]) -> np.ndarray:
-        """Drawn (y, x) of each field of an element, (fields, fields, 2), µm; the same for the same seed."""
+        """Random displacement (y, x) of each field, (fields, fields, 2), µm; the same for the same seed."""
         count = math.ceil(size_px / self.field_px(pitch_um))
         return self.sigma_um * np.random.default_rng(seed).standard_normal((count, count, 2))
 
     def drawn(self, height_um: Tensor, pitch_um: float, seed: list[int]) -> Tensor:
-        """A print (size, size), µm, whose fields lie off their places as this seed draws them."""
+        """A print (size, size), µm, whose fields are displaced as this seed draws."""
         offsets_um = self.offsets_um(len(height_um), pitch_um, seed)
         return in_fields(height_um, pitch_um, self.field_px(pitch_um), offsets_um)
 
@@ -45,14 +45,15 @@ class Stitching(Record):
 
 
 def in_fields(height_um: Tensor, pitch_um: float, field_px: int, offsets_um: np.ndarray) -> Tensor:
-    """A print whose write fields lie off their places, of the print as if in one piece; differentiable.
+    """The print with displaced write fields, from the print in one piece; differentiable.
 
-    A gap between two fields is bare, and where fields overlap the height is their mean: what is written twice
-    grows no taller. A pixel that comes to lie across four gives each the share that it covers.
+    A gap between two fields is bare, and where fields overlap the height is their mean, because writing twice
+    makes nothing taller. A displaced pixel is divided among the four pixels that it covers.
 
     Args:
         height_um: print (size, size), µm.
-        field_px: side of a field; ``offsets_um``: (y, x) of every field, (fields, fields, 2), µm.
+        field_px: side of a field; ``offsets_um``: displacement (y, x) of every field, (fields, fields, 2),
+            µm.
 
     Returns:
         Heights of the same shape.

@@ -1,4 +1,4 @@
-"""The virtual fab as a judge: it prints a finished layout; designing needs gradients, which it has not.
+"""The virtual fab as a judge: it prints finished layouts, but has no gradients to design with.
 
 It shares no code with the models and includes the effects that were hidden in their training prints, so it
 prints what the machine would have printed.
@@ -20,7 +20,7 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# A separate stream: no scan of the run in the truth file has this roughness.
+# A separate random stream, so that no scan of the run in the truth file has this roughness.
 _ROUGHNESS_STREAM = 2
 
 
@@ -35,10 +35,10 @@ class ElementJob(Job):
 
 
 class FabSimulator(nn.Module):
-    """Print as the virtual fab of a ``truth.json`` does, surface roughness included, scan effects not.
+    """Print like the virtual fab of a ``truth.json``, with surface roughness but without scan effects.
 
-    Called as a frozen model is, but without gradients. The roughness is the same for every layout of
-    one size, so that prints of several layouts differ by their layouts only.
+    It is called like a frozen model but has no gradients. The roughness is the same for every layout of one
+    size, so prints of several layouts differ only by their layouts.
     """
 
     name = "fab"
@@ -50,7 +50,7 @@ class FabSimulator(nn.Module):
         self.printer, self.noise = truth.printer, truth.noise
         self.knobs = KnobBoard([knob.setting for knob in truth.knobs], truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
-        # Everything that decides the print; its hash identifies the fab as weights identify a model.
+        # Everything that determines the print; its hash identifies the fab as weights identify a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
         self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
 
@@ -69,7 +69,7 @@ class FabSimulator(nn.Module):
 
 
 def is_fab(source: str | Path) -> bool:
-    """Whether ``source`` is a truth file of ``litho-data simulate``, or the folder with one."""
+    """Whether ``source`` is a truth file of ``litho-data simulate``, or a folder with one."""
     path = Path(source)
     return path.name == Truth.FILE_NAME or (path / Truth.FILE_NAME).is_file()
 
@@ -78,7 +78,8 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
     """The fab of a truth file.
 
     Raises:
-        InputError: no truth file, or a layout of another pitch, level height or more levels than it prints.
+        InputError: no truth file, or a layout with another pitch or level height, or with more levels, than
+            it prints.
     """
     fab = FabSimulator(Truth.read(source))
     asked = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um}

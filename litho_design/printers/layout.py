@@ -1,4 +1,4 @@
-"""Layouts: geometry and levels, and what a printer must resolve to print them."""
+"""Layouts: their geometry and levels, and what a printer must resolve to print them."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class LayoutSettings(Record):
 
 
 class Printability(Record):
-    """Fabrication figures of a layout; lengths in µm, shares of neighbouring pixel pairs."""
+    """Fabrication figures of a layout: lengths in µm, and shares of the pairs of neighbouring pixels."""
 
     pitch_um: float
     free_cell_um: float
@@ -105,9 +105,9 @@ class Printability(Record):
 def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
     """What a printer must resolve to print a layout.
 
-    A feature is a run of pixels of one level along a row or a column that ends at other levels on
-    both sides; runs that touch the border are not counted, they may continue in a neighbour. In a ring
-    layout rows cut rings at every angle, so the narrowest ring is also given, along a radius.
+    A feature is a run of pixels of one level along a row or a column that ends at other levels on both sides.
+    Runs that touch the border are not counted, because they may continue in a neighbour. In a ring layout,
+    rows cut rings at every angle, so the narrowest ring along a radius is also given.
 
     Args:
         levels: integer levels (ny, nx).
@@ -130,7 +130,7 @@ def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
 
 
 def _smallest_ring_um(levels: np.ndarray, layout: LayoutSettings) -> float | None:
-    """Narrowest run of one level along the radius; None without rings, or where only one level is left."""
+    """Narrowest run of one level along the radius; None without rings, or with only one level."""
     if layout.symmetry != "radial":
         return None
     middle_y, middle_x = (side // 2 for side in levels.shape)

@@ -1,4 +1,4 @@
-"""A printer applied to one element: layout levels in, printed height out."""
+"""A printer for one element: layout levels in, printed height out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Precision = Literal["float32", "bfloat16"]
 
 
 class TilingCheck(Record):
-    """Difference between a print computed as a whole and in tiles.
+    """Difference between a print computed as a whole and the same print in tiles.
 
     For models with a finite reach this is rounding; for others (a Fourier operator) an error of the model.
     """
@@ -36,7 +36,7 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """The printer of a design or a score; the dataset is that of the model's training."""
+    """The printer of a design or a score; ``dataset`` is that of the model's training."""
 
     name: str
     sha256: str
@@ -89,12 +89,12 @@ class Printer(nn.Module):
 
     @property
     def only_judges(self) -> bool:
-        """Whether it prints without gradients: layouts cannot be searched through it."""
+        """Whether it prints without gradients, so that no layout can be searched through it."""
         return isinstance(self.simulator, FabSimulator)
 
     @property
     def depends_on_position(self) -> bool:
-        """Whether added effects may depend on the place in the write field, as no patch can show."""
+        """Whether added effects may depend on the position in the write field, which a patch lacks."""
         return bool(self.card.get("process_effects"))
 
     @property
@@ -116,17 +116,17 @@ class Printer(nn.Module):
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
     def print_again(self, level: Tensor) -> Tensor:
-        """As ``print_patch``, but nothing is kept for the gradient: it prints the patch a second time."""
+        """Like ``print_patch``, but nothing is kept for the gradient, which prints the patch again."""
         if torch.is_grad_enabled():
             again: Tensor = checkpoint(self.print_patch, level, use_reentrant=False)
             return again
         return self.print_patch(level)
 
     def print_in_tiles(self, level: Tensor, tile_px: int) -> Tensor:
-        """Printed height as by ``forward``, in tiles with their halo that are computed again for gradients.
+        """Printed height as by ``forward``, but in tiles with halos, which the gradient computes again.
 
-        Memory grows with ``tile_px`` instead of the element. The same as ``forward`` up to rounding for
-        models of finite reach; ``tiling_check`` measures the difference for others.
+        Memory grows with ``tile_px`` instead of the element. For models of finite reach the result equals
+        that of ``forward`` up to rounding; for others ``tiling_check`` measures the difference.
         """
         halo = self.halo_px
         around = F.pad(level, (halo,) * 4)
@@ -140,15 +140,15 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
-        """Compare the print of the whole element with tiles printed on their own, halo included.
+        """Compare the print of the whole element with separately printed tiles with halos.
 
         Args:
             level: layout (1, 1, size, size).
             tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
 
         Returns:
-            The differences; None where there is nothing to compare: nominal heights, an element not larger
-            than one tile, or a print that depends on the position.
+            The differences; None if there is nothing to compare: nominal heights, an element not larger than
+            one tile, or a print that depends on the position.
         """
         size, halo = self.layout.size_px, self.halo_px
         if self.simulator is None or size <= tile_px or self.depends_on_position:
@@ -156,7 +156,7 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Odd starts: a multiple of the model's own tile would compare it with itself.
+        # Odd starts, because at a multiple of the model's own tile the tile would be compared with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):
@@ -174,7 +174,7 @@ class Printer(nn.Module):
     def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
         """Run the networks of a frozen model in ``precision`` inside the block.
 
-        Other models, and heights, blurs and waves, stay in float32.
+        Other models stay in float32, as do heights, blurs and waves.
         """
         at_precision = getattr(self.simulator, "at_precision", None)
         return nullcontext() if at_precision is None else at_precision(precision)
@@ -191,7 +191,7 @@ class Printer(nn.Module):
         )
 
     def weights_sha256(self) -> str:
-        """Hash of every parameter and buffer as it is now; equal before and after a design run."""
+        """Hash of the present values of all parameters and buffers; a design run must not change it."""
         digest = hashlib.sha256()
         state = {} if self.simulator is None else self.simulator.state_dict()
         for name in sorted(state):
@@ -202,7 +202,7 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def level_heights_um(self) -> list[float]:
-        """Printed height of a wide uniform field of each level, µm: the level table of the advisor."""
+        """Printed height of a wide uniform field of each level, µm, for the table of levels."""
         if self._level_heights_um:
             return self._level_heights_um
         size = 2 * self.guard_px + 16
@@ -216,7 +216,7 @@ class Printer(nn.Module):
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
         """Print of ``height_um`` without its outer ``border_px``."""
-        # A frozen model computes of the border only what the rest needs.
+        # A frozen model computes only as much of the border as the rest needs.
         inside: Callable[..., Tensor] | None = getattr(self.simulator, "inside", None)
         if inside is not None:
             return inside(height_um, border_px, pitch_um=self.layout.pitch_um)
@@ -230,10 +230,10 @@ class Printer(nn.Module):
 
 
 def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
-    """Guard ring, and what a patch, and two rows of pixels, need around them.
+    """Widths in pixels of the guard ring, and of the halos of a patch and of two rows of pixels.
 
     A model that runs on tiles needs a whole tile around a patch. Two rows of pixels lie where two rows of
-    tiles are blended, whose mean errs less than one of them.
+    tiles are blended, and the mean of two tiles errs less than one.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

@@ -14,7 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# The zoo models that judge a design, one of each kind. Ridges extrapolate badly from smooth layouts.
+# The zoo models that judge a design, one of each kind, except for ridge regression, which extrapolates badly
+# from smooth layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 
@@ -28,8 +29,8 @@ def load_printer(
 ) -> Printer:
     """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
 
-    The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
-    call it; the model's own name by default. A loaded printer is returned unchanged.
+    The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is the printer's name in
+    results, by default the model's own. A loaded printer is returned unchanged.
 
     Raises:
         InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
@@ -86,7 +87,7 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Judges of the zoo that were trained on the prints of the first of some models, and are none of them.
+    """Judges from the zoo, trained on the same prints as the first ``known`` model but not among them.
 
     A model that was not calibrated for the layout is left out.
     """
@@ -95,7 +96,7 @@ def models_at_hand(
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
-        # By their cards: weights of another printer need not be loaded to be left out.
+        # Selected by their cards, so that models of another printer need not be loaded.
         card = zoo.card(name)
         if (card.get("dataset") or {}).get("sha256") != dataset:
             continue

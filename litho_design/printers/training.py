@@ -1,4 +1,4 @@
-"""How a layout compares with the layouts that a model was trained on: its levels, and its steps."""
+"""How the levels and steps of a layout compare with those of a model's training layouts."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from litho_design.printers.layout import LayoutSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Half of the pixels at levels that the training layouts hardly have: mostly extrapolation.
+# If half of the pixels have levels that are rare in the training layouts, the print is mostly extrapolated.
 _FLAG_DISTANCE = 0.5
-# A tenth of all neighbours: a few borders do not make a layout unusual.
+# A tenth of all neighbours, because a few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
-# What a layout may have more often than the training layouts; half a per cent of anything is no news.
+# A layout may have a level or step this many times as often as the training layouts, or by this share more.
 ALLOWED_TIMES = 2.0
 _ALLOWED_SHARE = 0.005
 
@@ -28,11 +28,11 @@ class OutOfDistribution(Record):
     """Distance of a layout from the model's training layouts.
 
     Two total-variation distances: between the histograms of levels, and between those of the steps of
-    neighbouring pixels. ``unusual`` says what the layout has and they have not. Steps are absent where the
-    card of the model has none.
+    neighbouring pixels. ``unusual`` says what the layout has much more of. Steps are absent if the model's
+    card has none.
     """
 
-    # Older designs also have the scores of a layout closer to them.
+    # Older designs also hold scores of a layout closer to the training layouts.
     model_config = ConfigDict(extra="ignore")
 
     level_distance: float
@@ -46,7 +46,7 @@ class OutOfDistribution(Record):
 def out_of_distribution(
     levels: np.ndarray, layout: LayoutSettings, card: Mapping[str, Any]
 ) -> OutOfDistribution | None:
-    """Compare a layout (ny, nx) with the histograms in a model's card; None where the card has none."""
+    """Compare a layout (ny, nx) with the histograms in a model's card; None if the card has none."""
     trained = training_share(card, "training_level_share", layout.levels)
     if trained is None:
         return None
@@ -71,7 +71,7 @@ def out_of_distribution(
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
-    """A histogram of a model's card over at least ``levels`` values, its sum 1; None where it has none."""
+    """A histogram from a model's card over at least ``levels`` values, sum 1; None if the card has none."""
     trained = np.asarray(card.get(name) or [], dtype=float)
     if trained.size == 0:
         return None
@@ -81,11 +81,12 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
 def own_error_um(
     card: Mapping[str, Any], height_um: Tensor, pitch_um: float, relief_um: float
 ) -> Tensor | float:
-    """Rms error that a model has by its card on a print (ny, nx), µm, as it had on those it was made of.
+    """Expected rms error of a model on a print (ny, nx), µm, from its errors on the prints in its card.
 
-    It grows with the square of the rms slope, as what models miss at edges does, and with the relief that is
-    wanted (its standard deviation), where these exceed those of the older prints. Gains vary, too. The mean
-    absolute error of normal errors is sqrt(2 / pi) of the rms one. 0 where the card has no prints.
+    It grows with the square of the rms slope, because models err at edges, or with the standard deviation of
+    the wanted relief, if these exceed those of the card's prints. The scatter of the prints' gains is added.
+    Errors are taken as normal, so the mean absolute error is sqrt(2 / pi) of the rms error. 0 if the card has
+    no prints.
     """
     import torch
 
@@ -108,7 +109,7 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """In words, what ``share`` has much more of than ``trained``; nothing where that is little."""
+    """In words, what ``share`` has much more of than ``trained``; empty if nothing."""
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:
         return []

@@ -11,7 +11,7 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ReliefSettings(DesignSettings):
-    """All settings of one relief; wavelength and distance only serve the report of the stroke."""
+    """All settings of one relief; wavelength and distance only matter for the stroke in the report."""
 
     layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
     search: SearchSettings = setting(

@@ -47,9 +47,9 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """What a print (size, size) was off from its expectation, µm, without its mean, blurred: float32.
+    """Deviation of a print (size, size) from its expectation, µm, blurred and without its mean: float32.
 
-    A second print differs from the first by its roughness, which the blur takes out.
+    The roughness of a second print will differ from that of the first, so the blur removes it.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -58,7 +58,7 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
 
 
 def _float_tiff(path: Path) -> np.ndarray | None:
-    """Heights in µm of a TIFF of floating-point numbers; None for anything else."""
+    """Heights in µm from a TIFF of floating-point numbers; None for any other file."""
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None
     import tifffile

@@ -25,13 +25,14 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# Gains of an affine layout, over the inverse of the printer's; where between the ends of the levels it lies.
+# Gains of an affine layout relative to the inverse of the printer's gain; positions between the ends of the
+# levels.
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
-    """Height errors of a print without their mean: the zero of a print is that of its base."""
+    """Height errors of a print without their mean, because the zero of a print depends on its base."""
 
     rms_nm: float = Field(description="rms error of the print, offset free, nm")
     mae_nm: float = Field(description="mean absolute error, offset free, nm")
@@ -40,7 +41,7 @@ class ReliefScore(Record):
 
 
 class _Bare(nn.Module):
-    """What is seen of a relief is the relief."""
+    """The bench of a relief: what is seen is the relief itself."""
 
     def __init__(self, layout: LayoutSettings):
         super().__init__()
@@ -54,11 +55,11 @@ class _Bare(nn.Module):
 class ReliefTask(Task):
     """A wanted height map (size, size), µm, as ``load_relief`` gives it with its record.
 
-    ``off_um`` among the inputs is what a first print was off from its expectation, without its mean: the
-    search expects it again. Figures are those of the print alone, as others will measure it.
+    The input ``off_um`` is the deviation of a first print from its expectation, without its mean; the search
+    expects the same deviation again. Figures describe the print alone, as others will measure it.
 
     Raises:
-        InputError: a start for light, or spreads that no propagator could take.
+        InputError: a start that is for light, or spreads beyond the range of any propagator.
     """
 
     name = "relief"
@@ -81,7 +82,7 @@ class ReliefTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # What the model has to print, so that the printer prints the target.
+        # The height that the model has to print so that the printer prints the target.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
@@ -101,7 +102,7 @@ class ReliefTask(Task):
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """The rms error to be expected, µm: that of the model's print, and the model's own."""
+        """The expected rms error, µm, from the error of the model's print and the model's own error."""
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
@@ -118,35 +119,35 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Errors without the offset: where the zero is free, no print passes or fails by it."""
+        """Errors except for the offset: the zero is free and must not decide whether a print passes."""
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels that print the height where it is uniform, at the best zero, or the best affine ones."""
+        """Levels whose uniform print has the wanted height at the best zero, or the best affine levels."""
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
         return min((*starts, self.cells.average(self._best_affine)), key=self._worst_loss)
 
     def untouched(self) -> dict[str, Tensor]:
-        """The layout of the wanted heights as they are, and the best affine one."""
+        """The layout with the wanted heights unchanged, and the best affine layout."""
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Errors of the two layouts of ``untouched``, and of levels of any height."""
+        """Errors of the two layouts of ``untouched``, and of levels that need not be whole."""
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
 
     @property
     def _nominal(self) -> Tensor:
-        """Levels (size, size) of the wanted heights; a relief that reaches below 0 is lifted to it."""
+        """Levels (size, size) of the wanted heights; a relief that reaches below 0 is lifted to 0."""
         return self._affine(
             1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
         )
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Levels (size, size) of gain * height + zero whose worst error over the printers is the lowest."""
+        """Levels (size, size) of the gain * height + zero whose worst error over the printers is lowest."""
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
         unit = top * layout.level_height_um / (heights[-1] - heights[0])
@@ -173,17 +174,17 @@ class ReliefTask(Task):
         return max(float(self.loss_by(printer, printer(whole)[0, 0])[0]) for printer in self.printers)
 
     def thick_score(self, height_um: Tensor) -> None:
-        """A height is a height, whatever the light."""
+        """None: heights do not depend on the light."""
         return
 
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Also what is left of the target with levels of any height: no layout of this range prints it."""
+        """The task's arrays, and the error that remains even with real levels, which no layout avoids."""
         left = self.asked - self._free_print
         return super().arrays(height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
     def _free_print(self) -> Tensor:
-        """The print of levels that need not be whole, of the lowest loss, µm."""
+        """The print with the lowest loss of levels that need not be whole, µm."""
         search = self.settings.search
         free = DirectLevels(self.settings.layout).to(self.printer.device)
         free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
@@ -204,9 +205,9 @@ class ReliefTask(Task):
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
     ) -> Tensor:
-        """Real levels (*cells) that have a relief's heights where level k is ``level_heights_um[k]`` high.
+        """Real levels (*cells) that print a relief's heights if level k is ``level_heights_um[k]`` high.
 
-        Zero is free: the relief lies at this place between the lowest and the highest of the levels.
+        ``zero`` places the relief between the lowest (0) and the highest level (1).
         """
         heights, target = np.asarray(level_heights_um), relief_um.cpu().numpy()
         room_um = (heights[-1] - heights[0]) - np.ptp(target)

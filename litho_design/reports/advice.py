@@ -1,4 +1,4 @@
-"""What to know about a layout before printing it, in words; used by commands and reports."""
+"""Advice about a layout before it is printed, in words; used by commands and reports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
-# Figures whose key, spelt out, says too little; what each is, the descriptions of the scores say.
+# Names of figures whose key, spelt out, says too little; the scores' field descriptions explain them.
 WORDS: Words = {
     key: (name, "")
     for key, name in {
@@ -25,7 +25,7 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures that a score is told by, where it has them: what is said, decimals, and a factor.
+# Figures that summarise a score, if it has them: text, decimals, and a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -46,7 +46,7 @@ _SEEN_SHARE = 0.02
 
 
 def named(figure: str) -> str:
-    """The name of a score's figure for people."""
+    """The readable name of a score's figure."""
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
@@ -56,7 +56,7 @@ def called(printer: str) -> str:
 
 
 def distribution_warning(design: Design) -> str:
-    """A warning where a layout is far from the training layouts, or where that is unknown; else empty."""
+    """A warning if a layout is far from the training layouts or the distance is unknown; else empty."""
     gauge = design.out_of_distribution
     if gauge is None:
         if design.printer.source == "none" or LEVELS_FILE not in design.files:
@@ -76,7 +76,7 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """What the models of the printer at hand say of the layout; empty where there is only its own."""
+    """What the available models of the printer say about the layout; empty if there is only its own."""
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
         return ""
@@ -96,10 +96,10 @@ def width_sentence(design: Design) -> str:
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """A figure as the first model states it, in the median and at worst, and whether models differ by more.
+    """A figure by the first model, in the median and at worst, and whether the models differ too much.
 
     Args:
-        less: whether the figure is better when lower; ``gain``: what the design gains over doing nothing.
+        less: whether the figure is better when lower; ``gain``: gain of the design over doing nothing.
     """
     name, _, unit = named(figure).partition(" (")
     unit = f" {unit.rstrip(')')}" if unit else ""
@@ -117,7 +117,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
 
 
 def thickness_warning(design: Design) -> str:
-    """A warning where the same print does clearly worse as a thick element; else empty."""
+    """A warning if the same print performs clearly worse as a thick element; else empty."""
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
         return ""
@@ -132,7 +132,7 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """What the printed levels reach, and what a full wave needs."""
+    """The stroke that the printed levels reach, and what a full wave would need."""
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
         f"The highest level prints {stroke.stroke_waves:.2f} waves above the lowest (gain "
@@ -156,7 +156,7 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """The few numbers of a score that a command ends with, with a measurement's uncertainty."""
+    """The summary of a score that a command prints at its end, with a measurement's uncertainty."""
     sd = uncertainty or {}
 
     def told(name: str, digits: int, scale: int = 1) -> str:

@@ -47,7 +47,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page = Page(
         _TITLES.get(design.task, design.task),
         f"Designed through the printer model “{design.printer.name}”; "
-        "all scores are of the printable layout.",
+        "all scores are those of the printable layout.",
         run=design.run,
         facts=identity(design),
         words=WORDS,

@@ -21,9 +21,9 @@ from litho_design.tasks.design import Design
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# With fewer, an interval over seeds is missing or says nothing.
+# With fewer seeds, an interval over them is missing or meaningless.
 _FEWEST_SEEDS = 3
-# Of each arm a design, and the image that each judge's print gives.
+# For each arm a design, and the image behind each judge's print.
 _Judged = dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
@@ -96,7 +96,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """The best arm under each judge that is none of the arms, or else under every judge."""
+    """The best arm under each judge that is no arm, or else under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = -1 if figure in task_named(result.task).errors else 1
     unit = " dB" if figure.endswith("_db") else ""
@@ -135,7 +135,7 @@ def _caption(task: str, figure: str) -> str:
 
 
 def _label(figure: str) -> str:
-    """What a figure is; those of tasks of one's own have a name only."""
+    """The meaning of a figure; figures of your own tasks have only a name."""
     return _LABELS.get(figure) or named(figure)
 
 
@@ -157,7 +157,7 @@ def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:
 
 
 def _judged(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> _Judged:
-    """For every arm the image (or PSF) that each judge's print gives, first seed."""
+    """For every arm, the image (or PSF) behind each judge's print, first seed."""
     images = {}
     for arm, own in printers.items():
         if arm not in result.arms:

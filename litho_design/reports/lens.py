@@ -1,4 +1,4 @@
-"""What the report of a lens shows beside that of every design: profiles, MTF, focus and gain."""
+"""The part of a report that only lenses have: profiles, MTF, focus and gain."""
 
 from __future__ import annotations
 

@@ -26,13 +26,13 @@ BRIGHTEST = 1.5
 
 
 def add_notes(page: Page, design: Design) -> None:
-    """The remarks of the record, and where layout or element lie beyond what the scores can tell."""
+    """Warnings that the scores may not hold for the layout or element, and the remarks of the record."""
     notes = filter(None, (distribution_warning(design), thickness_warning(design), *design.notes))
     page.note(*(f"{capitalised(note)}." for note in notes))
 
 
 def identity(design: Design) -> dict[str, object]:
-    """What identifies a design at the foot of its report: hashes of printer and target, seed."""
+    """The facts that identify a design at the foot of its report: hashes of printer and target, seed."""
     search = design.settings.get("search", {})
     facts = {"printer": design.printer.name, "printer, SHA-256": design.printer.sha256}
     return {
@@ -65,9 +65,9 @@ def add_yield(
 
     Args:
         draws: figures of single prints on single benches.
-        window: the spreads that were drawn from.
-        figures: name to value of the print as modelled, and label.
-        passed: how many draws pass.
+        window: the spreads of the draws.
+        figures: for each name, the value of the print as modelled and a label.
+        passed: the result of the draws that pass.
         errors: figures that are better when lower.
     """
     page.heading("Process window", folded=True)
@@ -102,7 +102,7 @@ def add_yield(
 
 
 def meanings(score: type[Record]) -> dict[str, str]:
-    """What each number of a score means."""
+    """The meaning of each number of a score."""
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
@@ -110,7 +110,7 @@ def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """One row per figure, one column per print or baseline, and the meaning of each figure."""
-    # A task of one's own need not describe its figures.
+    # A task of your own need not describe its figures.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels
     )
@@ -155,7 +155,7 @@ def level_table(design: Design) -> dict[str, Any]:
 
 
 def add_gauge(page: Page, design: Design) -> None:
-    """What a printer must resolve, and the distance from the model's training layouts."""
+    """Add what a printer must resolve, and the distance from the model's training layouts."""
     page.heading("What the printer must resolve", folded=True)
     gauge = design.out_of_distribution
     tiling, ensemble = design.tiling, design.ensemble
@@ -172,7 +172,7 @@ def add_gauge(page: Page, design: Design) -> None:
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
     given = {name: value for name, value in figures.items() if isinstance(value, (int, float))}
-    # Kept apart from each other, so that a count stays a whole number.
+    # Separate values, so that a count stays a whole number.
     frame = {"name": list(given), "value": np.array(list(given.values()), dtype=object)}
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 
@@ -184,13 +184,13 @@ def picture_grid(
     highest: float = BRIGHTEST,
     unit: str = "",
 ) -> Figure:
-    """Pictures in rows and columns, all of them on one scale from 0.
+    """Pictures in rows and columns, all on one scale from 0.
 
     Args:
         rows: label of each row to its pictures (m, m), by title.
         side_um: extent of every picture, µm.
-        highest: value of the brightest colour, that of white in the target by default.
-        unit: of a colour bar; none without it.
+        highest: value of the brightest colour, by default that of white in the target.
+        unit: unit of the colour bar; without it there is no bar.
     """
     columns = max(map(len, rows.values()))
     two_lines = any("\n" in title for row in rows.values() for title in row)

@@ -81,7 +81,7 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """The design's own figure beside those of the models that judge it; empty with fewer than two of them."""
+    """The design's own figure beside those of its judging models; empty with fewer than two models."""
     task = task_named(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
     judged = {one.judge.name: one.figures.get(figure) for one in result.scores if one.kind == "model"}
@@ -91,7 +91,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """How much worse or better than expected, in the figure that a hologram is compared by."""
+    """How much worse or better than expected, in the figure that compares holograms."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

@@ -1,1 +1,1 @@
-"""A sheet of prints for a lab to make, and what its scans say when they come back."""
+"""A sheet of prints for a lab to make, and the evaluation of its scans."""

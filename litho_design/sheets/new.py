@@ -1,4 +1,4 @@
-"""What a lab needs to print and scan one sheet: layouts, witness patterns, and two versions of a hologram."""
+"""A sheet for a lab to print and scan: layouts, witness patterns, and two versions of a hologram."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# The two bands of the measured prints, cycles per µm, in turn.
+# Cut-offs of the random layouts in turn, those of the measured prints, cycles per µm.
 _CUTOFFS_PER_UM = (0.25, 0.5)
-# The stair takes three fifths of a side, and the printer rounds its edges: few wide steps.
+# Few wide steps, because the stair takes three fifths of a side and the printer rounds its edges.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
@@ -56,11 +56,11 @@ def new_sheet(
 
     Args:
         out: folder of the sheet; an interrupted run in it resumes.
-        model: the hologram is designed through it, and once without any.
-        format: of the printer's files, as for ``export``.
-        target: of the hologram; ``settings``: of both designs, a small one by default. All fields have its
-            size, pitch and levels.
-        layouts: random layouts to learn the printer from; ``seed``: decides them.
+        model: the hologram is designed once through this model and once without a model.
+        format: format of the printer's files, as for ``export``.
+        target: target of the hologram; ``settings``: settings of both designs, by default of a small
+            hologram. All fields have its size, pitch and levels.
+        layouts: number of random layouts to learn the printer from; ``seed``: their seed.
         device, announce: as for ``design_hologram``.
 
     Raises:
@@ -118,7 +118,7 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """The fields to learn from, by id: the witnesses first, then random ones."""
+    """The fields to learn from, by id: the witnesses first, then random layouts."""
     shape = geometry.size_px, geometry.size_px
 
     def random(number: int) -> np.ndarray:
@@ -143,7 +143,7 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
 def _exported(
     source: np.ndarray | Path, format: Format, folder: Path, name: str, geometry: LayoutSettings
 ) -> str:
-    """Write the printer's file of a field; its path within the sheet."""
+    """Write the printer's file of a field; returns its path within the sheet."""
     size = geometry.pitch_um, geometry.level_height_um
     file = export(source, format, folder / TO_PRINTER / name, pitch_um=size[0], level_height_um=size[1])
     return file.relative_to(folder).as_posix()

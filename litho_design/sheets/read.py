@@ -1,4 +1,4 @@
-"""What comes back of a sheet becomes a dataset, a model with its card, a closed loop and a comparison."""
+"""From the scans of a sheet to a dataset, a model with its card, a closed loop and a comparison."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, 
 from litho_design.workflows.score import score
 from litho_models import close_loop, evaluate, freeze
 
-# A sheet has too few scans for more.
+# A sheet has too few scans for a larger number.
 _BASE = "physics"
 
 
 def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
-    """Make of the scans of a sheet a model of the printer, what it lacks, and the hologram's two images.
+    """Turn a sheet's scans into a model of the printer, what it lacks, and the hologram's two images.
 
     Args:
         sheet: folder of ``new_sheet``, with the scans in it.

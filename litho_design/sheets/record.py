@@ -24,7 +24,7 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """What a lab was given; ``expected_db``: SI-PSNR of the image of each hologram by ``model``."""
+    """What a lab received; ``expected_db``: SI-PSNR of each hologram's image, predicted by ``model``."""
 
     SCHEMA: ClassVar[str] = "litho-design/sheet/1"
     FILE_NAME: ClassVar[str] = "sheet.json"
@@ -38,13 +38,14 @@ class Sheet(RunFacts, Result):
 
 
 class ReadSheet(RunFacts, Result):
-    """What the scans of a sheet say.
+    """The evaluation of a sheet's scans.
 
     Attributes:
-        model_nm: mean absolute error on the new prints of the model that designed; ``own_nm``: of the one
-            fitted to them, by cross-validation in the loop; ``corrected_nm``: with what the loop found.
-        found: effects that the loop added; ``verdict``: of the loop.
-        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: as it was predicted.
+        model_nm: mean absolute error on the new prints of the model used for the design; ``own_nm``: of the
+            model fitted to them, by cross-validation in the loop; ``corrected_nm``: of that model with the
+            effects that the loop found.
+        found: effects that the loop added; ``verdict``: verdict of the loop.
+        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: its prediction.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet-read/1"

@@ -1,4 +1,4 @@
-"""Light through a printed element onto a window of its size, once for every set of optics."""
+"""Light through a printed element onto a window of its size, for one or several sets of optics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_design.printers.layout import LayoutSettings
 class ElementBench(nn.Module):
     """Light of a source through a printed element onto the image plane (element and window of equal size).
 
-    ``propagator`` is that of the middle of the source.
+    ``propagator`` belongs to the middle of the source.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):
@@ -25,7 +25,7 @@ class ElementBench(nn.Module):
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.parts = coherent_parts(optics, layout.size_um)
         colours = {optics.wavelength_um: optics} | {part.wavelength_um: part for _, part in self.parts}
-        # Neither direction nor resin changes how light travels behind the element.
+        # Neither direction nor resin changes the propagation behind the element.
         self.carried = nn.ModuleDict(
             {_key(um): make_propagator(self.grid, self.grid, one, dtype=dtype) for um, one in colours.items()}
         )
@@ -48,7 +48,7 @@ class ElementBench(nn.Module):
 
 
 def _key(wavelength_um: float) -> str:
-    # A name of a module has no dot.
+    # Names of modules must not contain a dot.
     return wavelength_um.hex().replace(".", "_")
 
 

@@ -1,4 +1,4 @@
-"""The layout that a design returns: the searched one, or one of doing nothing that the models prefer."""
+"""The layout that a design returns: the searched one, or an uncorrected one if the models prefer it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from litho_design.tasks.width import SEARCHED, Width
 
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
-    """The candidate that the models at hand agree on most: that of the smallest largest loss.
+    """The candidate whose largest loss over the available models is smallest.
 
     Args:
         searched: levels of the search on the pixels (size, size).
 
     Returns:
-        Its levels, and the width of the design; None where there is one model and nothing to compare with.
+        Its levels, and the width of the design; None if there is only one model and nothing to compare.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
     models = {printer.name: printer for printer in (*task.printers, *task.judges)}

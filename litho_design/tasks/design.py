@@ -28,15 +28,15 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
-# Of a lens of rings, one value per pixel of the radius instead of levels and heights of a plane.
+# For a lens of rings: one value per pixel of the radius instead of levels and heights of a plane.
 RINGS_FILE = "ring_level.npy"
 RING_HEIGHT_FILE = "ring_height_um.npy"
-# Of a result that is made of several designs.
+# Folder of the designs of a result that contains several.
 DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device, duration with interrupted runs."""
+    """Command, software, device, and duration including interrupted runs."""
 
     device: str
     threads: int
@@ -46,7 +46,7 @@ class RunRecord(RunFacts):
 
     @classmethod
     def of(cls, device: torch.device, seconds: float, seconds_per_iteration: float) -> RunRecord:
-        """The record of the run that this process ends now."""
+        """The record of the run that this process is finishing."""
         return cls(
             **run_facts(),
             device=str(device),
@@ -58,7 +58,7 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """What a task finds out about its levels and their print; ``thick``: the print as a thick element."""
+    """What a task finds out about its levels and their print; ``thick``: figures as a thick element."""
 
     tiling: TilingCheck | None = None
     ensemble: EnsembleRecord | None = None
@@ -97,7 +97,7 @@ class Design(Findings, Result):
 
     @property
     def in_rings(self) -> bool:
-        """Whether it has levels and heights along one radius, and none of a plane."""
+        """Whether it has levels and heights along a radius instead of a plane."""
         return RINGS_FILE in self.files
 
     @property
@@ -128,7 +128,7 @@ def write_level_image(folder: Path, levels: np.ndarray) -> dict[str, str]:
 
 
 def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:
-    """One array of a design folder, checked against the hash in its record; ``on_disk`` leaves it there.
+    """One array of a design folder, checked against the hash in its record; ``on_disk`` maps the file.
 
     Raises:
         InputError: no such file, or one that changed after the design.

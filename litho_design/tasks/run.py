@@ -25,7 +25,7 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED
 
-# Layouts that every model prints: the searched one, and that of doing nothing. Seconds that a page takes.
+# Layouts that every model prints: the searched and the uncorrected one. Seconds that a page takes.
 _CANDIDATES, _PAGE_S = 2, 7.0
 # Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
@@ -58,7 +58,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         "target": task.target_record.model_dump(mode="json") if task.target_record else None,
         "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
     }
-    # Of the processes that share a design the first one keeps the folder.
+    # The first of the processes that share a design keeps the folder.
     with growing_folder(folder, Design.FILE_NAME, facts) if task.leads else nullcontext() as begun:
         if not task.together(begun is not None and begun.finished):
             _make(task, folder, facts, before, report if task.reported else None, announce and task.leads)
@@ -135,7 +135,7 @@ class _Found(NamedTuple):
 def _search(
     task: Task, folder: Path, fingerprint: str, announce: bool
 ) -> tuple[_Found, SearchState, Budget, float]:
-    """Levels per cell after search and polish; the search, what an iteration costs, and seconds in all."""
+    """Levels per cell after search and polish; the search, the cost of an iteration, and total seconds."""
     search, started = task.settings.search, time.monotonic()
     done = task.finished_iterations(folder)
     parameters = task.free_parameters()
@@ -165,7 +165,7 @@ def _search(
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """What choice, scores and yield will take, from one print by each model and one draw of the yield."""
+    """Time of choice, scores and yield, from one print by each model and one draw of the yield."""
     models = (*task.printers, *task.judges)
     started = time.perf_counter()
     heights = [one(level[None, None].float())[0, 0] for one in models]

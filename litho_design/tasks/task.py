@@ -1,4 +1,4 @@
-"""A task: what light shall do behind a printed element. Holograms and lenses are tasks; so is your own."""
+"""A task: what light should do behind a printed element. Holograms and lenses are tasks; write your own."""
 
 from __future__ import annotations
 
@@ -48,27 +48,28 @@ class Figures(Record):
 class Task:
     """What is wanted behind an element, ready to be optimised and scored through printers.
 
-    For a task of your own, give ``name``, ``views`` where one image is not enough, ``loss`` and
-    ``figures``, and pass the class to ``register_task``. Everything else can stay: search, checkpoints,
-    polish, process window, comparison, report, export.
+    For a task of your own, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``,
+    and pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report
+    and export work without changes.
 
     Attributes:
-        name: in results; one for every task.
-        starts: starts of the search that make sense; ``start_jitter_levels``: noise that they get.
-        headline: figures that reports and commands show first; all of them where empty.
+        name: unique name of the task in results.
+        starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
+        headline: figures that reports and commands show first; if empty, all.
         errors: figures that are better when lower; ``loss_unit``: see ``Width``.
         polished, reported: whether the search ends with single-level changes, and the run with a page.
-        part, leads: its checkpoint, and whether it writes the record, where several processes share it.
+        part, leads: if several processes share the task: the name of its checkpoint, and whether it writes
+            the record.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
-        settings: as given, as are ``printer``, ``printers`` and ``inputs``; ``notes``: for the record.
+        settings, printer, printers, inputs: as given; ``notes``: notes for the record.
         bench: from a height map to what is seen, in the optics of the settings.
 
     Args:
         settings: geometry, optics, search, process window.
         printer: frozen model, or nominal heights.
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models: the loss is the worst over all, plus a penalty on what they disagree about.
-        record: where the inputs come from.
+        ensemble: further models; the loss is then the worst over all, plus a penalty on their disagreement.
+        record: source of the inputs.
 
     Raises:
         InputError: a start that the task does not have, or spreads beyond the range of the propagator.
@@ -102,24 +103,24 @@ class Task:
         self.inputs = dict(inputs or {})
         self.target_record = record
         self.notes: list[str] = []
-        # Models of the printer that take no part in the search.
+        # Models of the printer that the search does not use.
         self.judges: Sequence[Printer] = ()
         self.cells = self.make_cells().to(printer.device)
         self.bench: Any = self.make_bench(settings.optics)
         for optics in self.views(settings.optics):
             check_draws(settings.window, optics, self.bench.grid, self.bench.window)
 
-    # What a task of your own gives.
+    # Methods that a task of your own defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
         """The optics of every image: colours (``optics.at_wavelength``), planes, angles of incidence."""
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
-        """What is minimised, of what is seen: by default (views, size, size) shares of the incident power.
+        """The loss of what is seen, by default shares of the incident power (views, size, size).
 
         Returns:
-            A scalar, or one and its named parts.
+            A scalar, or a scalar and its named parts.
         """
         raise NotImplementedError
 
@@ -127,18 +128,18 @@ class Task:
         """Scores of what is seen, by name."""
         raise NotImplementedError
 
-    # What holograms and lenses do in their own way.
+    # Methods that holograms and lenses override.
 
     def make_cells(self) -> CellMap:
-        """From one value per free cell to the pixels that are searched."""
+        """The map from one value per free cell to the pixels of the search."""
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """From a height map (size, size), µm, to what is seen."""
+        """The optics, from a height map (size, size), µm, to what is seen."""
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels (*cells) where the search starts unless at random.
+        """Levels (*cells) at the start of the search, unless it starts at random.
 
         Args:
             level_phase: phase that each level prints, radian (levels,).
@@ -146,7 +147,7 @@ class Task:
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Layouts (size, size) of doing nothing about the printer, by name: the start at nominal heights."""
+        """Uncorrected layouts (size, size), by name: the start for nominal heights."""
         if set(self.starts) == {"random"}:
             return {}
         layout = self.settings.layout
@@ -168,16 +169,16 @@ class Task:
 
     @torch.no_grad()
     def printed_um(self, level: Tensor, printer: int = 0) -> Tensor:
-        """Height, µm, that a design keeps of its levels on the pixels."""
+        """Printed height of levels on the pixels, µm, which the design keeps."""
         return self.printers[printer](level[None, None].float())[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score of a print (size, size), µm, whose design expected another one, or the same."""
+        """Score of a print (size, size), µm, whose design expected ``expected_um``, by default the same."""
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score of a print as a thick element; None where the settings have one, or no light is involved."""
+        """Score of a print as a thick element; None if the settings already say thick, or without light."""
         if self.settings.optics.element == "thick":
             return None
         optics = self.settings.optics.model_copy(update={"element": "thick"})
@@ -194,7 +195,7 @@ class Task:
         return finished_iterations(folder, self.part)
 
     def together(self, value: bool) -> bool:
-        """Whether this holds for any of the processes that share the search, when all are here."""
+        """Whether ``value`` holds for any of the processes that share the search; waits for all of them."""
         return value
 
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
@@ -204,7 +205,7 @@ class Task:
         return write_arrays(folder, arrays) | write_level_image(folder, levels)
 
     def findings(self, level: Tensor, height_um: Tensor) -> Findings:
-        """What the record of a design says of its levels and their print."""
+        """What the record of a design says about its levels and their print."""
         settings, layout = self.settings, self.settings.layout
         whole, levels = level[None, None].float(), level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
@@ -220,22 +221,22 @@ class Task:
         )
 
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Arrays saved beside levels and heights: what is seen, and the inputs, by file name."""
+        """Arrays saved beside levels and heights, by file name: what is seen, and the inputs."""
         with torch.no_grad():
             seen = self.bench(height_um).cpu().numpy()
         return {IMAGE_FILE: seen} | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Efficiency of an ideal element, found from a print (size, size), µm, where that is defined."""
+        """Efficiency of an ideal element found from a print (size, size), µm; None if that is undefined."""
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores on the same grid that a design's are to be compared with: here those of a flat plate."""
+        """Scores on the same grid to compare a design's with; by default those of a flat plate."""
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """What is seen as reports show it: images over their brightest value, side by side in a square."""
+        """What is seen, as reports show it: images over their brightest value, side by side in a square."""
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
         tiles = np.zeros((side * side, *images.shape[1:]))
@@ -249,7 +250,7 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Draws of the process window in the loss with their benches; the print as modelled where none is."""
+        """Draws of the process window in the loss with their benches; the print as modelled without draws."""
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
         return [(draw, self.search_bench(draw.optics)) for draw in drawn] or [
@@ -271,8 +272,8 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        Of several models the worst of them, and their disagreement; over samples of the process window its
-        risk; then the penalties on what the printer can make.
+        With several models, it is their worst loss plus their disagreement; with samples of the process
+        window, the risk over them; then the penalties for the limits of the printer are added.
         """
         settings, prints = self.settings, [self.search_print(level, n) for n in range(len(self.printers))]
         losses: list[Tensor] = []
@@ -305,7 +306,7 @@ class Task:
         return scores
 
     def inputs_sha256(self) -> str:
-        """Hash of the inputs, and of the code of a task that is not of this package."""
+        """Hash of the inputs and, for a task from outside this package, of its code."""
         digest = hashlib.sha256()
         for name, array in sorted(self.inputs.items()):
             digest.update(
@@ -316,7 +317,7 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of what is seen of a print by this model, its named parts beside it: what ``loss`` gives."""
+        """Loss of what is seen behind this model's print, and its named parts; by default ``loss``."""
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})
 
@@ -325,7 +326,7 @@ _TASKS: dict[str, type[Task]] = {}
 
 
 def register_task(task: type[Task]) -> type[Task]:
-    """Make a task of your own known, so that its designs can be opened; also a decorator of the class.
+    """Register a task of your own, so that its designs can be opened; works as a class decorator.
 
     Raises:
         InputError: no name, or the name of another task.
@@ -342,7 +343,7 @@ def registered_task(name: str) -> type[Task]:
     """The task of that name.
 
     Raises:
-        InputError: no such task here.
+        InputError: no such task is registered.
     """
     if name not in _TASKS:
         raise unknown_name(
@@ -358,5 +359,5 @@ def _source(task: type) -> str:
     try:
         return inspect.getsource(task)
     except (OSError, TypeError):
-        # Typed into an interpreter: nothing to compare.
+        # Typed into an interpreter, so there is no source to compare.
         return ""

@@ -1,4 +1,4 @@
-"""The width of a design: its layout as every model of the printer at hand prints it, beside doing nothing."""
+"""The width of a design: its layout and the uncorrected ones as every available model prints them."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import numpy as np
 from litho_data.foundation.results import Record
 
 SEARCHED = "searched"
-# Of normal errors 95 % lie within twice their standard deviation.
+# 95 % of normal errors lie within twice their standard deviation.
 _SURE = 2.0
 
 
 class Width(Record):
-    """One entry per model: those of the search first, then the judges, which took no part in it.
+    """One entry per model: first those of the search, then the judges, which the search did not use.
 
     Attributes:
         searched_with: how many of the models the search used.
-        figures: by candidate and model, ``loss`` among them; candidates are the searched layout and those of
-            doing nothing.
+        figures: figures by candidate and model, including ``loss``; candidates are the searched layout and
+            the uncorrected ones.
         returned: the candidate whose largest loss over the models is the smallest.
-        figure: the first one of the task; ``less``: whether it is better when lower.
-        loss_unit: what turns a loss into the figure with the error of the model itself; None where it is no
-            such error.
+        figure: the first figure of the task; ``less``: whether it is better when lower.
+        loss_unit: factor from the loss to the figure that includes the model's own error; None if the loss is
+            no such error.
         level_heights_um: printed height of a wide field of each level, by model.
     """
 
@@ -40,7 +40,7 @@ class Width(Record):
 
     @property
     def between(self) -> tuple[float, float]:
-        """Where the figure of a print is to be expected: among models, and off by twice their own error."""
+        """Expected range of a print's figure: the range over models, widened by twice their own error."""
         values = self.values()
         if self.loss_unit is None:
             return float(values.min()), float(values.max())
@@ -51,7 +51,7 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """How much better the figure is than the best of doing nothing, the median over models."""
+        """Gain of the figure over the best uncorrected layout, as the median over models."""
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
         return float(np.median(sign * self.values() - np.max(idle, axis=0))) if idle else None
@@ -63,7 +63,7 @@ class Width(Record):
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """The level about whose height the models disagree most, and the lowest and highest of them, µm."""
+        """The level on whose height the models disagree most, with its lowest and highest height, µm."""
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]
         level = int(np.ptp(heights, axis=0).argmax())

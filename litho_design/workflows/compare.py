@@ -1,4 +1,4 @@
-"""Design with every arm and print with every judge: the design-to-manufacturing gap, as one folder."""
+"""Design with every arm and print with every judge: the design-to-manufacturing gap in one folder."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def compare(
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
-    All arms share every setting but the printer; a finished or interrupted design in ``out`` is
-    reused or resumed. The arms' own printers also judge, which completes the matrix.
+    All arms share every setting except for the printer; finished designs in ``out`` are reused, interrupted
+    ones resumed. The arms' own printers also judge, which completes the matrix.
 
     Args:
-        settings: of a hologram or a lens, which decides what is designed, or of ``task``; the seed of the
-            search is replaced by those of ``seeds``.
+        settings: settings of a hologram or a lens, which decide what is designed, or of ``task``; ``seeds``
+            replace the seed of the search.
         arms: printers to design with: models by name, or NAME=MODEL, MODEL, ``none`` and loaded printers.
         out: folder of the comparison.
         judges: further printers that only judge.
@@ -76,7 +76,7 @@ def compare(
         objects, held_out_objects: as for ``design_lens``.
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
-        workers: local processes; ``dask``: address of a Dask scheduler instead. They design.
+        workers: number of local processes that design; ``dask``: address of a Dask scheduler instead.
 
     Returns:
         The record written to ``out/gap.json``.
@@ -150,7 +150,7 @@ def _design(job: _Job) -> Design:
 
 
 def _judged(place: Path, arm: str, seed: int, printers: Mapping[str, Printer]) -> list[GapEntry]:
-    """One finished design as every printer prints it."""
+    """Entries for one finished design, as printed by every printer."""
     own = printers[arm]
     loaded = load_design(place, device=own.device)
     expected = loaded.printed_um(own)

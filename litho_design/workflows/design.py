@@ -55,14 +55,14 @@ def design_hologram(
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        judges: models, MODEL or NAME=MODEL, that print the finished layout, the width of the design; those of
-            the zoo that were trained on the same prints by default.
-        robust: search through the judges as well, as far as they have gradients: for the lowest worst loss,
-            plus a penalty on the models' disagreement.
-        band_px: rows of a band at most: designs in bands, for elements beyond the memory of a process. Those
-            that torchrun starts share them; with ``cuda`` each takes a GPU of its own. The one model has a
-            finite reach then, and nothing else prints the layout.
-        device: where models are loaded.
+        judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
+            by default the zoo's models that were trained on the same prints.
+        robust: search also through those judges that have gradients: for the lowest worst loss, plus a
+            penalty on the models' disagreement.
+        band_px: most rows of a band; designs in bands, for elements beyond the memory of a process. Processes
+            started by torchrun share the bands; with ``cuda`` each takes a GPU of its own. The model must
+            have a finite reach, and no judges print the layout.
+        device: device of the models.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting.
 
@@ -111,8 +111,8 @@ def design_lens(
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
-        tile_px: designs the rings of a lens that focuses light along a radius, in tiles of this length;
-            nothing of the plane is made, up to 10 mm and more. The model has a finite reach then.
+        tile_px: for a lens that focuses light: design its rings along a radius, in tiles of this length,
+            without computing the plane, up to 10 mm and more. The model must have a finite reach.
         judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
@@ -156,16 +156,17 @@ def correct(
             of heights in µm (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
-        after: folder of a first correction whose print was measured; ``scan``: that measurement. What the
-            print was off from its expectation is expected again.
+        after: folder of a first correction whose print was measured; ``scan``: that measurement. The
+            deviation of that print from its expectation is expected again.
         judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
 
     Raises:
-        InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders; ``after``
-            without ``scan`` or the reverse, a first element of another layout, or a scan that is not its.
+        InputError: what ``load_relief`` refuses, or what ``design_hologram`` refuses about models and
+            folders; ``after`` without ``scan`` or the reverse, a first element of another layout, or a scan
+            of another element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -180,7 +181,7 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """What the measured print of a first element was off, as an input of the second; none without a first."""
+    """The deviation of a first element's measured print, as an input of the second; empty without a first."""
     if after is None and scan is None:
         return {}
     if after is None or scan is None:
@@ -212,7 +213,7 @@ def design(
     """Optimise the layout for a task of your own (see ``Task``).
 
     Args:
-        task: a class that ``register_task`` knows.
+        task: a class registered by ``register_task``.
         model: as for ``design_hologram``.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search, process window; ``design_settings()`` by default.
@@ -223,7 +224,8 @@ def design(
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: a task that is not registered, or what ``design_hologram`` refuses of models and folders.
+        InputError: a task that is not registered, or what ``design_hologram`` refuses about models and
+            folders.
     """
     if isinstance(task, str):
         hint = "design_hologram, design_lens and correct design what the package knows"
@@ -248,7 +250,7 @@ def _designed(
     device: Device,
     extrapolate: bool,
 ) -> Design:
-    """The design of a task, made when its printers are there: they are refused before a target is read."""
+    """The design of a task; printers are loaded first, to refuse bad ones before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
     rivals = (
@@ -263,7 +265,7 @@ def _designed(
 
 
 def _alone(objects: Iterable[Any], judges: Iterable[Any] | None, robust: bool) -> tuple[()]:
-    """The judges of a large element: none."""
+    """Refuse objects, judges and ``robust`` for a large element; returns no judges."""
     if robust or tuple(objects) or judges:
         got = "objects or judges"
         raise InputError("large element", got=got, wanted="one design through one model")

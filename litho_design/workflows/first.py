@@ -1,4 +1,4 @@
-"""A first result: one small hologram designed without and with a model of the printer, both printed by it."""
+"""A first result: one small hologram designed without and with a printer model, which prints both."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from litho_design.judging.gap import GapResult
 from litho_design.printers.source import Device
 from litho_design.workflows.compare import compare
 
-# The design for a perfect printer, the model that the other is made through, and a further judge.
+# Nominal heights for the first design, the model for the second, and a further judge.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
 def small_hologram() -> HologramSettings:
-    """Small enough for a minute on two cores, and close enough for its size to draw the letters."""
+    """Settings small enough for a minute on two cores, with a distance at which it can draw the letters."""
     small = {
         "layout.size_px": 256,
         "optics.distance_um": 25,
@@ -40,12 +40,12 @@ def first(
     Args:
         out: folder of the result; its ``report.html`` shows target, prints and images side by side.
         target: as for ``design_hologram``.
-        settings: of both designs; a hologram that takes about a minute by default.
+        settings: settings of both designs; by default a hologram that takes about a minute.
         device, announce: as for ``design_hologram``.
 
     Returns:
-        The record written to ``out/gap.json``, as ``compare`` writes it. Physics, through which
-        neither was designed, judges both too.
+        The record written to ``out/gap.json``, as by ``compare``. Physics, which neither design used, also
+        judges both.
 
     Raises:
         InputError: what ``compare`` refuses.

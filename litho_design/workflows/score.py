@@ -35,22 +35,21 @@ def score(
 ) -> ScoreResult:
     """Score the layout of a design by every judge, and write ``score.json`` and a report.
 
-    A lens in rings (``lens --large``) is printed and scored along its radius.
+    A lens of rings (``lens --large``) is printed and scored along its radius.
 
     Args:
-        design: its folder, or what ``load_design`` gives.
+        design: a design, as its folder or from ``load_design``.
         out: folder of the score.
         judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Those
             with the weights of the design's own model are marked as not independent. Without judge, scan and
-            photograph the models of the zoo that were trained on the same prints.
+            photograph, the zoo's models that were trained on the same prints judge.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
-        element: ``thick`` judges every print by the wave propagation method; ignored for a design that is
-            loaded.
-        stitch: write fields that the prints of the judges are made of, each off its place.
-        band_px: rows of a band at most, to print and score a large hologram band by band.
-        device: where prints and waves are computed; ignored for a design that is loaded.
+        element: ``thick`` judges every print by the wave propagation method; ignored for a loaded design.
+        stitch: displaced write fields of the judges' prints.
+        band_px: most rows of a band, to print and score a large hologram band by band.
+        device: where prints and waves are computed; ignored for a loaded design.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
     Raises:

@@ -1,1 +1,1 @@
-"""Boards: stores of the virtual fab whose causes are hidden, and the judge of what a loop says of them."""
+"""Boards: stores made by the virtual fab with hidden causes, and the judge of what a loop says about them."""

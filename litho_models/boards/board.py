@@ -1,4 +1,4 @@
-"""A board anyone's loop can enter: stores that hide causes, what was hidden beside them, and the judge."""
+"""A board that any loop can enter: stores with hidden causes, a record of what they hide, and the judge."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
-# The printers of single causes are Physics models; mixtures have others too, so there the bases compete.
+# On singles every printer is a Physics model; mixtures have others too, so there the best base is chosen.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
-# A dataset store and an empty folder to work in, to what the loop says.
+# Maps a dataset store and an empty working folder to what the loop says.
 Loop = Callable[[Path, Path], Answer]
 
 
@@ -50,7 +50,7 @@ def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str
     Raises:
         InputError: settings that cannot be drawn, or fields that cannot be printed.
     """
-    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
+    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed before a trial fails on them
     trials = draw_board(board, seed)
     return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
 
@@ -68,15 +68,15 @@ def new_board(
 
     Args:
         out: folder of the board.
-        board: one cause a trial, or two to four; ``seed``: decides everything.
-        trials: only so many of those that are drawn, which are in random order.
-        n_scans: of each store; ``size_px``: side of a layout.
+        board: one cause per trial, or two to four; ``seed``: decides everything that is drawn.
+        trials: make only the first so many of the drawn trials (in random order); None: all.
+        n_scans: scans in each store; ``size_px``: side of a layout.
 
     Raises:
         InputError: settings that cannot be drawn, or a folder with another board.
     """
     drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
-    # Causes in measured prints need a store of those.
+    # A trial in measured prints needs a store of measured prints, which this board does not have.
     kept = [draw for draw in drawn.trials if draw.kind != "measured"][:trials]
     draws = drawn.model_copy(update={"trials": kept})
     facts = draws.model_dump(mode="json", exclude={"schema_"})
@@ -105,16 +105,16 @@ def judge_board(
     name: str | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> Scoreboard:
-    """Give a loop every store of a board, judge what it says, and write ``scoreboard.json`` and its table.
+    """Give every store of a board to a loop, judge its answers, and write ``scoreboard.json`` and its table.
 
-    An error inside the loop is the result of that trial. An interrupted run resumes.
+    An error inside the loop only fails that trial. An interrupted run resumes.
 
     Args:
         board: folder of ``new_board``.
-        out: folder of the trials, each with what the loop wrote there.
-        loop: given a store and an empty folder; by default the closed loop of this package.
-        name: what the loop is called; a folder of another one is refused.
-        report: told what the default loop does, a sentence at a time.
+        out: folder of the trials; each keeps what the loop wrote.
+        loop: function of a store and an empty folder; by default the closed loop of this package.
+        name: name of the loop; an ``out`` with the trials of another loop is refused.
+        report: gets the progress messages of the default loop.
 
     Raises:
         InputError: no board, or a folder with the trials of another board or loop.
@@ -145,15 +145,15 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """A loop that is a command: it is given STORE and FOLDER as its last words and writes FOLDER/answer.json.
+    """Wrap a command as a loop: its last arguments are STORE and FOLDER, and it writes FOLDER/answer.json.
 
     Raises:
-        InputError: from the loop, a command that cannot be run, ends with another code than 0, or writes no
-            answer.
+        InputError: a command that cannot be run; from the loop, a command that exits with a code other
+            than 0 or writes no answer.
     """
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
-        raise InputError("command of the loop", got=command or "nothing", wanted="a program and its words")
+        raise InputError("command of the loop", got=command or "nothing", wanted="a program with arguments")
 
     def loop(store: Path, folder: Path) -> Answer:
         code = subprocess.run([*words, str(store), str(folder)], check=False).returncode
@@ -177,7 +177,7 @@ def _trial(draw: Draw, draws: Draws, board: Path, folder: Path, loop: Loop) -> T
 
 
 def name_of(draw: Draw) -> str:
-    """Two digits, as files and folders of a trial are called."""
+    """Name of a trial's files and folders: two digits."""
     return f"{draw.number:02d}"
 
 
@@ -187,13 +187,13 @@ def store_of(board: Path, draw: Draw) -> Path:
 
 
 def cpu_s() -> float:
-    """Processor seconds of this process and of those that it has waited for."""
+    """Processor seconds of this process and of the children it has waited for."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def trial_line(trial: Trial) -> str:
-    """A trial in a line: what became of each cause, false names, error, reason of a failure."""
+    """A trial in one line: what became of each cause, false names, error, and why it failed."""
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false: {name}" for name in trial.false_names]
     ratio = trial.errors and trial.errors.ratio

@@ -13,7 +13,7 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
 
-# Largest error after that is accepted, as a multiple of that of the true models.
+# Largest accepted error after the loop, as a multiple of the true models' error.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -22,7 +22,7 @@ _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
 
 
 class Figure(NamedTuple):
-    """A figure that counts, in words, and what was aimed at before the board was run; empty if nothing."""
+    """A headline figure in words, and its target, set before the board was run; empty without a target."""
 
     what: str
     value: str
@@ -62,7 +62,7 @@ def share(hits: Iterable[bool]) -> str:
 
 
 def counted(trials: Iterable[Trial]) -> list[Counted]:
-    """Causes above 8 nm; of a trial that failed before they were sized, those drawn above it."""
+    """Causes above 8 nm; in a trial that failed before they were sized, those drawn above 8 nm."""
     found = []
     for trial in trials:
         sizes = {one.name: one.wanted_rms_nm for one in trial.draw.causes}
@@ -76,7 +76,7 @@ def counted(trials: Iterable[Trial]) -> list[Counted]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """The figures that count; a failed trial counts as not found, its error as too large."""
+    """The headline figures; in a failed trial no cause counts as found, and its error counts as too large."""
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
     empty = [
@@ -105,7 +105,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
 
 
 def figure_lines(scoreboard: Scoreboard) -> list[str]:
-    """The figures that count as lines of a terminal."""
+    """The headline figures as lines for a terminal."""
     return [
         f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else "")
         for what, value, wanted in figures_of(scoreboard)
@@ -113,13 +113,13 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Whether the mean absolute error after is within the tolerance; False without an error."""
+    """Whether the mean absolute error after the loop is within the tolerance; False if it is unknown."""
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= tolerance(trial)
 
 
 def tolerance(trial: Trial) -> float:
-    """Largest error after that is accepted, as a multiple of that of the true models."""
+    """Largest accepted error after the loop, as a multiple of the true models' error."""
     return TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 
 
@@ -187,7 +187,7 @@ def _causes(what: str, causes: Iterable[Counted], verdicts: Sequence[Verdict], w
 
 
 def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
-    """One row per planted cause, and one per trial without; sizes in nm, empty where there is none."""
+    """One row per planted cause, and one per trial without causes; sizes in nm, empty where unknown."""
     rows: list[dict[str, Any]] = []
     for trial in scoreboard.trials:
         set_as = {one.draw.name: one for one in trial.planted}

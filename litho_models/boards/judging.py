@@ -1,4 +1,4 @@
-"""The judge: what a loop says against what was planted, and the error that the true models make.
+"""The judge: compare what a loop says with what was planted, and its error with that of the true models.
 
 The rules are written down in docs/blind_trials.md, before a board is run.
 """
@@ -21,26 +21,26 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# A form that is right under the name of a family only with this exponent.
+# For these forms the name of a family is right only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
-# Made of offsets of lines: to see those is to notice it.
+# This form consists of line offsets: a loop that reports those has noticed it.
 _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Without what the fab's default noise has in every scan: datum, bow, offsets of lines, their like."""
+    """Leave out what the fab's default noise puts into every scan: datum, bow, line offsets and the like."""
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
 
 def judged(
     draw: Draw, planted: Sequence[Planted], answer: Answer, jobs: Sequence[Job], store: Store, used_s: float
 ) -> Trial:
-    """The trial as it came out.
+    """Judge one trial.
 
     Args:
-        draw: of the trial; ``planted``: what was planted, as `plant` returns it.
-        answer: of the loop; ``used_s``: processor seconds that it took.
+        draw: the trial as drawn; ``planted``: what was planted, as `plant` returns it.
+        answer: what the loop says; ``used_s``: processor seconds that it took.
         jobs: the fields that were printed; ``store``: what the loop was given.
     """
     locked = set(store.locked_ids)
@@ -68,9 +68,9 @@ def judge(
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """One outcome per planted cause, in order; one for the trial where nothing was planted.
+    """One outcome per planted cause, in order; one for the whole trial if nothing was planted.
 
-    What the loop reports counts for one cause at most, for the larger one first.
+    Each thing that the loop reports counts for one cause at most; larger causes come first.
     """
     found = answer.found
     left = answer.left or bool(_beyond_noise(found))
@@ -101,7 +101,7 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Sets of causes that the loop named and that have nothing of what was planted, base included."""
+    """Sets of causes that the loop named although nothing in them was planted, the base's form included."""
     return [
         " | ".join(named.names)
         for named in _beyond_noise(answer.found)
@@ -110,7 +110,7 @@ def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
 
 
 def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
-    """What was planted, the base's form aside."""
+    """What was planted, without the base's form."""
     return [one for one in planted if one.draw in draw.causes]
 
 
@@ -124,7 +124,7 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Whether scans share a displacement along x by a grouping that parts them as planted."""
+    """Whether the loop found a displacement along x by a grouping that separates scans as planted."""
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
         labels: dict[str, set[bool]] = {}
@@ -135,8 +135,8 @@ def _displacement_is_shared(
     return False
 
 
-# What no model of all scans can predict: values drawn anew in every scan (or line), rounding, and scars where
-# chance put them. A bend stays in: the store's own transform of the scan has it.
+# What no model of all scans can predict: values drawn anew in every scan (or line), rounding, and scars at
+# random places. A bend stays in, because the store's transform of the scan contains it.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -180,7 +180,7 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Median of the relative errors of the base's values, as fitted alone and with all that was found.
+    """Median relative error of the base's values, fitted alone and together with all that was found.
 
     None if printer or base is no Physics model.
     """
@@ -190,7 +190,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # The sd of the squared spot, where the base has it free.
+    # The sd of the squared spot, where the base fits it.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:
@@ -200,9 +200,9 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 
 
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
-    """The result of a trial that an error ended, which is printed.
+    """The result of a trial that ended with an error; the error is also printed.
 
-    Results are published, so places on this machine are called by their names.
+    Results are published, so paths on this machine are replaced by names.
     """
     traceback.print_exception(error)
     reason = f"{type(error).__name__}: {error}"
@@ -212,7 +212,7 @@ def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping
 
 
 def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
-    """The result of a trial that did not come to an end."""
+    """The result of a trial that did not finish."""
     names = [one.name for one in draw.causes] or ["none"]
     return Trial(
         draw=draw,

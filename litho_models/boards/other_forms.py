@@ -1,7 +1,7 @@
-"""Causes of another form than the catalogue's: other laws, axes, reaches, scales; and bases beyond Physics.
+"""Causes whose form is not in the catalogue: other laws, axes, reaches, scales; and bases beyond Physics.
 
-They are written against the virtual fab alone. Neither this module nor the drawing reads the loop's catalogue
-of effects. What is drawn for a form (a direction, a distance, a place) follows from the seed of its trial.
+They use the virtual fab alone: neither this module nor the drawing reads the loop's catalogue of effects. The
+seed of a trial decides what is random in its forms (a direction, a distance, a place).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from litho_data.virtual_fab.geometry import ScanFrame
 
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
-# (field, strength, canvas or frame of the scan, job) to the changed field.
+# Maps (field, strength, canvas or frame of the scan, job) to the changed field.
 Law = Callable[..., np.ndarray]
 Draw = Callable[[np.random.Generator], Law]
 
@@ -39,7 +39,7 @@ class Form:
         limit: largest strength, in ``unit``; at strength 0 a law changes nothing.
         meaning: what a strength of one unit does, and what is drawn.
         deck: boards that deal it; ``base`` belongs to the printer of a mixture and is not dealt.
-        names: names in the catalogue that are right for it; most have none.
+        names: names in the catalogue that are right for it; most forms have none.
     """
 
     name: str
@@ -88,7 +88,7 @@ def _number(name: str) -> int:
 def _form(
     name: str, stage: Stage, unit: str, limit: float, deck: Deck = "both", names: tuple[str, ...] = ()
 ) -> Callable[[Draw], Draw]:
-    """Enter a drawing function into the list; its docstring says what the form does."""
+    """Register a drawing function as a form; its docstring says what the form does."""
 
     def enter(draw: Draw) -> Draw:
         meaning = " ".join((draw.__doc__ or "").split())
@@ -103,7 +103,7 @@ def _form(
 
 @_form("far-copy", "dose", "1", 0.6)
 def _far_copy(rng: np.random.Generator) -> Law:
-    """Dose of a displaced copy; 6–15 µm away in a direction that is drawn."""
+    """Dose of a copy that is displaced by 6–15 µm in a drawn direction."""
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -157,7 +157,7 @@ def _halo_ring(rng: np.random.Generator) -> Law:
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
 def _fast_axis_memory(rng: np.random.Generator) -> Law:
-    """Share of the dose lost to what the same hatch line wrote before; fades over 3–8 µm."""
+    """Share of the dose lost to what the same hatch line wrote before; it fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -169,7 +169,7 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: np.random.Generator) -> Law:
-    """Relative gain of the dose at full density, with its cube; density over 2.5–5 µm."""
+    """Relative gain of the dose at full density, as the cube of the density over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
@@ -178,7 +178,7 @@ def _crowding(rng: np.random.Generator) -> Law:
 
 @_form("alternate-slices", "dose", "1", 2.0)
 def _alternate_slices(rng: np.random.Generator) -> Law:
-    """Slices that every second level gets too many or, by chance, too few."""
+    """Slices that every second level has too many or too few; the sign is drawn."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -190,7 +190,7 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: np.random.Generator) -> Law:
-    """Sd that the spot gains from one print on; the print is drawn in the middle of the order."""
+    """Sd added to the spot from one print on, drawn from the middle of the printing order."""
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
         blur(dose, canvas.pitch_um, strength) if job.order > first else dose
@@ -219,7 +219,7 @@ def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
 
 @_form("lee-side-loss", "surface", "µm", 2.0)
 def _lee_side_loss(rng: np.random.Generator) -> Law:
-    """Height lost per slope on the flanks that fall in one direction; the others keep theirs."""
+    """Height lost per slope on the flanks that fall in one direction; other flanks lose nothing."""
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -228,7 +228,7 @@ def _lee_side_loss(rng: np.random.Generator) -> Law:
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: np.random.Generator) -> Law:
-    """Share lost of the height between two heights 0.15–0.25 µm apart; 1 makes them one plateau."""
+    """Share of the height lost between two heights 0.15–0.25 µm apart; at 1 they become one plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
         surface - strength * np.clip(surface - lower_um, 0.0, width_um)
@@ -246,7 +246,7 @@ def _fringes(rng: np.random.Generator) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: np.random.Generator) -> Law:
-    """Gain of all that is finer than 0.6–1.2 µm: edges stand out on both sides."""
+    """Gain of all detail finer than 0.6–1.2 µm: edges overshoot on both sides."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
@@ -270,7 +270,7 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
 
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: np.random.Generator) -> Law:
-    """Share of a blurred surface (0.7–1.2 µm) at one side of the field; none at the other side."""
+    """Share of a blurred surface (0.7–1.2 µm) at one side of the field, falling to 0 at the other."""
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -297,7 +297,7 @@ def _seam_in_height(rng: np.random.Generator) -> Law:
 
 @_form("seam-in-place", "surface", "µm", 1.5)
 def _seam_in_place(rng: np.random.Generator) -> Law:
-    """Displacement along the seam of what lies on one side of it."""
+    """Displacement along a seam of everything on one side of it."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -337,7 +337,7 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
     return law
 
 
-# As on the measured prints: in every board of mixtures
+# As on the measured prints; in every mixtures board
 
 
 @_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
@@ -350,7 +350,7 @@ def _linear_slope_loss(rng: np.random.Generator) -> Law:
 
 @_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
 def _s_shaped_axis(rng: np.random.Generator) -> Law:
-    """Displacement along x of the scan, quadratic and cubic in x; the seed draws their shares."""
+    """Displacement of the scan along x, quadratic and cubic in x; their shares are drawn."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
     def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
@@ -363,7 +363,7 @@ def _s_shaped_axis(rng: np.random.Generator) -> Law:
     return law
 
 
-# Printers that the Physics model cannot be
+# Printers that the Physics model cannot imitate
 
 
 @_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
@@ -379,15 +379,15 @@ def _two_part_spot(rng: np.random.Generator) -> Law:
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
 def _hill_response(rng: np.random.Generator) -> Law:
-    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) in the response, the rest the logistic."""
+    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) in the response; the rest is logistic."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        # What the default printer's logistic converts as the Hill curve does the dose.
+        # Doses at which the default printer's logistic converts what the Hill curve converts at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
-        # The curve may pass full conversion where doses add up, and a logistic never reaches its end.
+        # Where doses add up the curve may exceed full conversion, which a logistic never reaches.
         response = np.minimum(low + (high - low) * hill, 0.99)
         return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
 
@@ -396,7 +396,7 @@ def _hill_response(rng: np.random.Generator) -> Law:
 
 @_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
 def _elliptical_blur(rng: np.random.Generator) -> Law:
-    """Sd that the spot gains along one direction."""
+    """Sd added to the spot along one direction."""
     direction = rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: apply_transfer(
         dose, np.exp(-2 * (np.pi * strength * _frequency_along(canvas, direction)) ** 2)
@@ -404,7 +404,7 @@ def _elliptical_blur(rng: np.random.Generator) -> Law:
 
 
 def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:
-    """The dose beside ``strength`` times itself spread, by a transfer function that is 1 at rest."""
+    """Mean of the dose and, weighted by ``strength``, the dose spread by a transfer function (1 at f = 0)."""
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
@@ -419,12 +419,12 @@ def _slope_along(surface: np.ndarray, canvas: Canvas, direction: float) -> np.nd
 
 
 def _across(canvas: Canvas, axis: int) -> np.ndarray:
-    """Place over the layout along an axis (0: y, 1: x), 0 at its first edge, 1 at its last."""
+    """Position on the layout along an axis (0: y, 1: x), from 0 at its first edge to 1 at its last."""
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> np.ndarray:
-    """True on one side of a seam; ``side`` says across which axis, and which of the two."""
+    """True on one side of a seam; ``side`` says which axis it crosses, and on which side it is True."""
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

@@ -18,7 +18,7 @@ def own_loop(
 
 
 def answer_of(result: CloseLoop) -> Answer:
-    """What a closed loop says, in the terms of a board."""
+    """The result of a closed loop as the answer that a board expects."""
     added = [
         Found(
             names=[one.name, *one.confusable_with],

@@ -1,8 +1,8 @@
 """What a trial prints: its base parameters and fields, and what is planted at which strength.
 
-A cause is sized by what the best refitted base cannot take up. The noise-free scans with it are fitted by
-the Physics model, which contains the plain fab; each scan may add datum, gain, tilt, bow and an affine error
-of its registration. The rms of what is left is the size of the cause.
+The size of a cause is what the best refitted base cannot absorb. The Physics model, which contains the plain
+fab, is fitted to the noise-free scans with the cause; each scan may add datum, gain, tilt, bow and an affine
+error of its registration. The rms of what is left is the size.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# A strength is sought on four scans (both cut-offs, all of the order) and measured on all.
+# A strength is searched on four scans (both cut-offs, spread over the order); its size is measured on all.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
 
 def printer_of(draw: Draw) -> Printer:
-    """The printer of a trial: the default one but for what was drawn."""
+    """The printer of a trial: the default one with the drawn parameters."""
     return replace(Printer(), **draw.printer)  # type: ignore[arg-type]
 
 
 def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
-    """The fields that a trial prints; the same as of ``litho-data simulate`` at this seed."""
+    """The fields that a trial prints: those that ``litho-data simulate`` prints with this seed."""
     return tuple(random_jobs(Plan(n_scans, (size_px, size_px)), printer_of(draw), draw.seed))
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """Share of its strength that a cause has in a scan."""
+    """Share of its full strength that a cause has in a scan."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -66,9 +66,9 @@ def fab_of(
     """The fab as it prints and scans one field, with everything that was planted at the field's strength.
 
     Args:
-        draw: of the trial.
+        draw: the trial as drawn.
         planted: base and causes, as `plant` returns them.
-        noise, microscope: other than the defaults.
+        noise, microscope: in place of the defaults.
         without: causes that are left out.
     """
     strength = {one.draw.name: one.strength * share_of(one.draw, job) for one in planted}
@@ -86,18 +86,18 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Strengths that give the drawn sizes on these fields, each cause by itself; the base's form comes first.
+    """Find the strengths at which each cause alone has its drawn size on these fields; the base's form first.
 
-    Where the range of a strength ends before, the largest value is used and the size that it reached is
-    recorded: nothing is drawn anew. An alias is set by how much it changes the scans before a refit, which
-    takes most of it up.
+    Where the range of a strength ends below that size, its largest value is used and the size that it reaches
+    is recorded: nothing is drawn again. An alias is sized by how much it changes the scans before a refit,
+    because the refit absorbs most of it.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [(_as_alias if draw.kind == "alias" else _sized)(one, jobs, draw) for one in drawn]
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
-    """Print and scan all fields into raw files; returns their card, which says no more than it must."""
+    """Print and scan all fields into raw files; returns their card, which states only what it must."""
     (folder / "scans").mkdir(parents=True)
     for job in jobs:
         scan = scan_job(fab_of(draw, planted, job), job)
@@ -122,7 +122,7 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
     for job in jobs:
         fab = fab_of(draw, planted, job, noise=Noise.off(), microscope=Microscope.aligned())
         height = scan_job(fab, job).noiseless_um
-        # Scan and layout share their middle.
+        # Scan and layout have the same centre.
         margin = (height.shape[0] - job.level.shape[0]) // 2
         found.append(height[margin : len(height) - margin, margin : len(height) - margin])
     return found
@@ -133,7 +133,7 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
     Args:
         heights_um: (y, x) on the layout's grid, µm, one per job.
-        printer: whose parameters the fit starts from.
+        printer: the fit starts from its parameters.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
     model = plain_model(printer)
@@ -146,7 +146,7 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
 
 class _Refit(ModelProblem):
-    """The model's own problem, the terms of each scan made orthonormal as sums of squares want them."""
+    """The fit of the model with orthonormal terms of each scan, as a fit to sums of squares needs them."""
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]
@@ -204,7 +204,7 @@ def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
 
 
 def _as_alias(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    """Sized by the noise-free scans with minus without it, freed of the scans' own terms only."""
+    """Size an alias by the noise-free scans with it minus those without, freed of the scans' own terms."""
     wanted, printer, limit = drawn.wanted_rms_nm, printer_of(draw), _limit(drawn.name)
 
     def change_nm(strength: float) -> float:

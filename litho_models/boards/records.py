@@ -10,7 +10,7 @@ from litho_data.foundation.results import Record, Result
 
 Board = Literal["singles", "mixtures"]
 Kind = Literal["in-form", "alias", "other-form", "empty", "mixture", "measured"]
-# Causes of a smaller rms are listed and not counted.
+# Causes of a smaller rms are listed but not counted.
 COUNTS_FROM_RMS_NM = 8.0
 Verdict = Literal[
     "right",
@@ -26,11 +26,11 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A knob or a form, and the size that it is to have, see `Planted.rms_nm`.
+    """A knob or a form, and its wanted size, see `Planted.rms_nm`.
 
     Attributes:
-        by: ``batch``: scans after ``place`` of the order have ``weak`` times the strength; ``field``: scans
-            whose id ends with none of ``place`` do.
+        by: ``batch``: scans after ``place`` in the printing order have ``weak`` times the strength;
+            ``field``: scans whose id ends in none of the digits of ``place`` have it.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Draw(Record):
 
     Attributes:
         seed: decides its layouts, its noise and what its knobs draw.
-        printer: what differs from the default printer; ``base``: a form by which it is no Physics model.
+        printer: what differs from the default printer; ``base``: a form that no Physics model has.
     """
 
     number: int
@@ -57,7 +57,7 @@ class Draw(Record):
 
 
 class Draws(Result):
-    """All trials of a board, written before the first of them runs; ``base`` is the loop's."""
+    """All trials of a board, written before any of them runs; ``base``: the model that loops correct."""
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trial-draws/2"
     FILE_NAME: ClassVar[str] = "draws.json"
@@ -76,7 +76,7 @@ class Planted(Record):
     Attributes:
         names: names in the effects catalogue that are right for it.
         strength: in ``unit``; ``at_limit``: its range ended before the wanted size was reached.
-        rms_nm: what base, scan terms and registration, refitted to the noise-free scans, leave of it alone.
+        rms_nm: rms that it alone leaves after a refit of base, scan terms and registration without noise.
     """
 
     draw: CauseDraw
@@ -92,7 +92,7 @@ class Planted(Record):
 
 
 class Hidden(Result):
-    """What one store of a board hides; a loop does not see it."""
+    """What one store of a board hides; the loop does not see this file."""
 
     SCHEMA: ClassVar[str] = "litho-models/board-hidden/1"
     FILE_NAME: ClassVar[str] = "hidden.json"
@@ -110,7 +110,7 @@ class Outcome(Record):
 class TrialErrors(Record):
     """Mean absolute error on held-out scans, k = 1: of the base, with all that was found, of the true models.
 
-    Of measured prints there are none of these.
+    For measured prints the true models are unknown.
     """
 
     before_nm: float
@@ -119,7 +119,7 @@ class TrialErrors(Record):
 
     @property
     def ratio(self) -> float | None:
-        """Error after over that of the true models."""
+        """Ratio of the error with all that was found to that of the true models."""
         return self.after_nm / self.floor_nm if self.floor_nm else None
 
 
@@ -127,8 +127,8 @@ class Found(Record):
     """One thing that a loop reports.
 
     Attributes:
-        names: of the catalogue, its own first, then those that look the same.
-        by: ``all``; ``scan`` where every scan has its own; or what its strength differs by.
+        names: its name in the catalogue, then those of effects that look the same.
+        by: grouping by which its strength differs; ``scan``: one strength per scan; ``all``: one for all.
         exponents: intervals of its exponent, where it is a power law.
     """
 
@@ -139,16 +139,16 @@ class Found(Record):
 
 
 class Answer(Result):
-    """What a loop says of one store.
+    """What a loop says about one store.
 
     Attributes:
         found: causes, laws and descriptions.
         left: whether something is left that it cannot explain.
-        absorbed: names of effects that its base takes up.
+        absorbed: names of effects that its base absorbs.
         displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
-        before_nm, after_nm: mean absolute error on scans that the fit has not seen, one offset per scan free:
-            without and with what was found; over the scans that are not locked. None: not stated.
-        base_values, corrected_values: the Physics model's, without and with what was found.
+        before_nm, after_nm: mean absolute error without and with what was found, over the scans that are not
+            locked, each by a fit that has not seen it, one offset per scan free. None: not stated.
+        base_values, corrected_values: values of the Physics model, without and with what was found.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/board-answer/1"
@@ -165,10 +165,10 @@ class Answer(Result):
 
 
 class Trial(Result):
-    """One trial as it came out; a failed one has a reason and no errors.
+    """The result of one trial; a failed one has a reason and no errors.
 
     Attributes:
-        false_names: sets of causes that the loop named and of which nothing was planted.
+        false_names: sets of causes that the loop named although nothing in them was planted.
         bias: median of the relative errors of the base's values, without and with what was found; None where
             the printer is no Physics model, or the loop chose another base.
         dataset_cpu_s: processor seconds of build and loop.
@@ -191,7 +191,7 @@ class Trial(Result):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending`` are drawn but not run. ``command`` makes it again."""
+    """All trials of a board; ``pending`` are drawn but not run; ``command`` makes the scoreboard again."""
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trials/3"
     FILE_NAME: ClassVar[str] = "scoreboard.json"

@@ -61,9 +61,9 @@ VariantOption = Annotated[
 Steps = Annotated[int | None, option("optimiser steps; the recipe's by default", min=1)]
 PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
-    option("of the products within networks in training; the recipe's by default", hidden=True),
+    option("of the products inside networks during training; the recipe's by default", hidden=True),
 ]
-Seed = Annotated[int, option("of weights and splits", min=0)]
+Seed = Annotated[int, option("seed of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
@@ -95,7 +95,7 @@ def train(
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("train on the locked scans too; nothing is left to judge by", "--use-lock-box"),
+        option("also train on the locked scans; then no scan is left to judge by", "--use-lock-box"),
     ] = False,
 ) -> None:
     """Train a model on all scans but the locked ones; resumable.
@@ -131,7 +131,7 @@ def evaluate(
     open_lock_box: Annotated[
         bool,
         option(
-            "score the locked scans of the dataset that the model was trained on too; once per release",
+            "also score the locked scans of the dataset that the model was trained on; once per release",
             "--open-lock-box",
         ),
     ] = False,
@@ -172,10 +172,10 @@ def benchmark(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
-    folds: Annotated[int, option("of the grouped split", min=2)] = 5,
+    folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
-        option("only so many of the folds, to compare seeds; all by default", min=1, hidden=True),
+        option("fit only this many folds, to compare seeds; all by default", min=1, hidden=True),
     ] = None,
     policy: PolicyOption = None,
     background: SharedOption = None,
@@ -186,7 +186,7 @@ def benchmark(
     seed: Seed = 0,
     training_seed: Annotated[
         int | None,
-        option("of weights and crops alone, same split; --seed by default", min=0, hidden=True),
+        option("seed of weights and crops alone, with the same split; --seed by default", min=0, hidden=True),
     ] = None,
     set_: SetOption = None,
     workers: WorkersOption = 1,
@@ -264,7 +264,7 @@ def export(
     frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
-        f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs by "
+        f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs from the model by "
         f"{NM_PER_UM * difference_um:.2g} nm at most"
     )
 
@@ -317,7 +317,7 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "whose the effects of undetermined role are, of all of them or of one; repeatable",
+            "what causes the effects of undetermined role, for all of them or for one; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,

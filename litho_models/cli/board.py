@@ -16,13 +16,13 @@ board = typer.Typer(help="Blind boards: can a loop name what the virtual fab hid
 def new(
     out: Annotated[Path, typer.Option("--out", help="folder of the board")],
     kind: Annotated[
-        Literal["singles", "mixtures"], typer.Option("--kind", help="one cause a store, or two to four")
+        Literal["singles", "mixtures"], typer.Option("--kind", help="one cause per store, or two to four")
     ] = "singles",
     seed: Annotated[int, typer.Option("--seed", min=0, help="decides what is hidden")] = 0,
     trials: Annotated[
-        int | None, typer.Option("--trials", min=1, help="stores; all that are drawn by default, some 40")
+        int | None, typer.Option("--trials", min=1, help="number of stores; by default all, about 40")
     ] = None,
-    scans: Annotated[int, typer.Option("--scans", min=2, help="of each store")] = 12,
+    scans: Annotated[int, typer.Option("--scans", min=2, help="scans in each store")] = 12,
     size_px: Annotated[int, typer.Option("--size-px", help="side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:
     """Print and scan in the virtual fab with hidden causes: stores for a loop, the truth for the judge.
@@ -45,7 +45,7 @@ def judge(
         str | None,
         typer.Option(
             "--loop",
-            help="command of the loop: it gets STORE and FOLDER as last words and writes FOLDER/answer.json; "
+            help="command of the loop: its last arguments are STORE and FOLDER; writes FOLDER/answer.json; "
             "by default close-loop of this package",
         ),
     ] = None,

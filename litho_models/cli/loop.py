@@ -1,4 +1,4 @@
-"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, what would tell, is it still so?"""
+"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, how to find out, does it hold?"""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ FixOption = Annotated[
     list[str] | None, option("a number of the model that no fit changes, such as eta; repeatable", "--fix")
 ]
 FreeOption = Annotated[
-    list[str] | None, option("a number that is fitted though usually it is not; repeatable", "--free")
+    list[str] | None, option("a number to fit although it is usually fixed; repeatable", "--free")
 ]
 
 
@@ -24,8 +24,8 @@ def close_loop(
     stores: Annotated[
         list[Path],
         argument(
-            "dataset store made by litho-data build; further stores, later prints of the same printer, "
-            "decide what the first leaves open"
+            "dataset store made by litho-data build; further stores hold later prints of the same printer "
+            "and decide what the first leaves open"
         ),
     ],
     out: Annotated[Path, option("folder for result, report, tables and the corrected model")],
@@ -39,24 +39,24 @@ def close_loop(
     ] = None,
     fix: FixOption = None,
     free: FreeOption = None,
-    folds: Annotated[int, option("by scan", min=2)] = 5,
+    folds: Annotated[int, option("number of folds, by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
-        option("also choose all anew without each fold, or print, and judge it there; slow"),
+        option("also repeat every choice without each fold, or print, and judge it there; slow"),
     ] = None,
     inject: Annotated[
         list[str] | None,
-        option("plant NAME=AMOUNT (its own unit) in copies of the data: is it found?"),
+        option("plant NAME=AMOUNT (in the unit of the effect) in copies of the data: is it found?"),
     ] = None,
     open_lock_box: Annotated[
         bool, option("also score the locked scans; do this once", "--open-lock-box")
     ] = False,
-    steps: Annotated[int | None, option("optimiser steps of a network as base, per fold", min=1)] = None,
+    steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
     cache: Annotated[
         Path | None,
         option("folder of a network's trainings per fold; beside --out by default"),
     ] = None,
-    seed: Annotated[int, option("folds and bootstrap, not the lock box", min=0)] = 0,
+    seed: Annotated[int, option("seed of folds and bootstrap, not of the lock box", min=0)] = 0,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
@@ -95,7 +95,7 @@ def close_loop(
     typer.echo(f"report: {out / 'report.html'}")
 
 
-# Neither bad input (2) nor a defect of ours (1).
+# Neither bad input (2) nor a defect of this package (1).
 EXIT_ALARM = 3
 
 
@@ -109,11 +109,11 @@ def check(
     ] = None,
     new: Annotated[
         list[str] | None,
-        option("a print of STORE that is new, the others are the reference; repeatable"),
+        option("a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
     residuals: Annotated[
         list[Path] | None,
-        option("folder of `benchmark` on the reference prints: errors of prints that no fit had seen"),
+        option("folder of `benchmark` on the reference prints, for errors on prints that no fit had seen"),
     ] = None,
     false_alarms: Annotated[float, option("share of unchanged data sets that raise an alarm")] = 0.005,
     tolerance: Annotated[
@@ -148,14 +148,14 @@ def check(
 def next_print(
     loop: Annotated[Path, argument("folder of litho-models close-loop")],
     out: Annotated[Path, option("folder of the plan: card, layouts, table of scans, sheets, report")],
-    prints: Annotated[int, option("prints to plan, references apart", min=1)] = 4,
+    prints: Annotated[int, option("prints to plan, not counting references", min=1)] = 4,
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],
-        option("random: a control, the same scans of layouts with nothing optimised"),
+        option("random: a control, with the same scans of layouts that are not optimised"),
     ] = "optimised",
-    seed: Annotated[int, option("of the random layouts to start from", min=0)] = 0,
-    steps: Annotated[int, option("of the ascent of each tile", min=0)] = 40,
+    seed: Annotated[int, option("seed of the random layouts to start from", min=0)] = 0,
+    steps: Annotated[int, option("steps of the ascent for each tile", min=0)] = 40,
 ) -> None:
     """Plan the prints and scans that decide what a closed loop left open; resumes after a kill.
 

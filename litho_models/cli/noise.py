@@ -18,7 +18,7 @@ def noise(
     context: typer.Context,
     out: Annotated[Path, option("folder for noise.json, report and tables")],
     store: Annotated[
-        Path | None, argument("dataset store; its scans of use substrate, flat and steps are used")
+        Path | None, argument("dataset store; its scans marked substrate, flat or steps are used")
     ] = None,
     substrate: Annotated[Path | None, option("scan of the bare substrate, without a store")] = None,
     flat: Annotated[Path | None, option("scan of a flat print, without a store")] = None,
@@ -66,7 +66,7 @@ def noise(
 
 
 def _check_given(context: typer.Context) -> None:
-    """A store, or files with a flat print among them, and each with its own options only."""
+    """Require a store, or files with a flat print among them, and only the options of the one given."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
@@ -82,4 +82,4 @@ def _check_given(context: typer.Context) -> None:
     if "flat" in given and (of_a_store := options(OF_A_STORE)):
         raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
     if "level_height_um" in given and "store" not in given and "steps" not in given:
-        raise InputError("noise", got="--level-height-um", wanted="--steps with it, whose nominal step it is")
+        raise InputError("noise", got="--level-height-um", wanted="--steps too, the scan of the steps")

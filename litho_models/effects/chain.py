@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-import torch
 from torch import Tensor, nn
 
-from litho_models.effects.effect import Effect, FieldContext
+from litho_models.effects.effect import ActsOn, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
 from litho_models.simulator import Simulator, Tile
 
@@ -35,15 +34,9 @@ class EffectChain(nn.Module):
         super().__init__()
         self.base = base
         self.frames = frames or {}
-        self.names = tuple(in_forward_order(list(effects)))
-        for name in self.names:
-            effect = get_effect(name)
-            for parameter, value in effect.with_values(effects[name]).items():
-                tensor = torch.tensor(float(value))
-                if effect.parameters[parameter].kind == "choice":
-                    self.register_buffer(_key(name, parameter), tensor)
-                else:
-                    self.register_parameter(_key(name, parameter), nn.Parameter(tensor))
+        self.values = {
+            name: get_effect(name).with_values(effects[name]) for name in in_forward_order(list(effects))
+        }
 
     @property
     def tile(self) -> Tile | None:
@@ -68,25 +61,11 @@ class EffectChain(nn.Module):
         """The base model's height with the height effects."""
         return self._run_stage("height", height_um, context)
 
-    def values(self) -> dict[str, dict[str, float]]:
-        """Parameter values of all effects as numbers."""
-        return {
-            name: {key: float(one.detach()) for key, one in self._tensors(get_effect(name)).items()}
-            for name in self.names
-        }
-
-    def _run_stage(self, acts_on: str, field: Tensor, context: FieldContext) -> Tensor:
-        for name in self.names:
+    def _run_stage(self, acts_on: ActsOn, field: Tensor, context: FieldContext) -> Tensor:
+        for name, values in self.values.items():
             effect = get_effect(name)
             if effect.acts_on == acts_on:
                 usual = "scan" if effect.stage == "measurement" else "print"
-                apply = effect.as_scanned if self.frames.get(name, usual) == "scan" else effect.apply
-                field = apply(field, self._tensors(effect), context)
+                scanned = self.frames.get(name, usual) == "scan"
+                field = effect(field, values, context, scanned=scanned)
         return field
-
-    def _tensors(self, effect: Effect) -> dict[str, Tensor]:
-        return {parameter: getattr(self, _key(effect.name, parameter)) for parameter in effect.parameters}
-
-
-def _key(name: str, parameter: str) -> str:
-    return f"{name.replace('-', '_')}__{parameter}"

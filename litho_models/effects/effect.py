@@ -242,22 +242,30 @@ class Effect:
                     f"{name} of {self.name}", got=value, wanted=f"{limits.lower:g} to {limits.upper:g}"
                 )
 
-    def __call__(self, array: Tensor, values: Mapping[str, float | Tensor], context: FieldContext) -> Tensor:
-        """Apply the effect; numbers become tensors on the array's device, parameters not named are off."""
+    def __call__(
+        self,
+        array: Tensor,
+        values: Mapping[str, float | Tensor],
+        context: FieldContext,
+        scanned: bool = False,
+    ) -> Tensor:
+        """Apply the effect; numbers become tensors on the array's device, parameters not named are off.
+
+        Args:
+            scanned: as one of the microscope, in the frame, the direction and with the tip of the scan.
+        """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
             for name, value in {**self.off_values(), **values}.items()
         }
-        return self.apply(array, tensors, context)
-
-    def as_scanned(self, height: Tensor, values: Values, context: FieldContext) -> Tensor:
-        """Apply an effect of the microscope: in the frame, the direction and with the tip of the scan."""
+        if not scanned:
+            return self.apply(array, tensors, context)
         if self.of_tip and context.new_tip:
-            return height
+            return array
         if context.backward:
-            values = {name: -v if name in self.reverses else v for name, v in values.items()}
+            tensors = {name: -v if name in self.reverses else v for name, v in tensors.items()}
         turn = context.quarter_turns % 4
-        seen = self.apply(torch.rot90(height, turn, (-2, -1)), values, context.in_scan_frame())
+        seen = self.apply(torch.rot90(array, turn, (-2, -1)), tensors, context.in_scan_frame())
         return torch.rot90(seen, -turn, (-2, -1))
 
 

@@ -66,21 +66,21 @@ def benchmark(
         models: names of models; baselines cost next to nothing.
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
-        first_folds: fit and score only so many of the folds, to compare seeds or settings; None for all.
+        first_folds: fit and score only this many folds, to compare seeds or settings; None for all.
         policy: nuisances of ``mae_datum_free_nm``; ``offset`` by default, for films ``none``.
         background: by default ``training``, for films ``none``. ``training``: each fit's smooth background,
-            learned on its training scans, is added to its predictions; ``shared``: they go through the
-            measurement model, learned there with the fit.
+            learned on its training scans, is added to its predictions; ``shared``: predictions go through the
+            measurement model, learned on the same scans with the fit.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
-        seed: of the split, the nuisance blocks and the training.
-        workers: local processes; ``dask``: address of a Dask scheduler instead. They fit and predict.
+        seed: seed of the split, the nuisance blocks and the training.
+        workers: local processes that fit and predict; ``dask``: address of a Dask scheduler instead.
 
     Raises:
         InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
             the split or for a lock box to open, more first folds than there are, a noise analysis of other
-            data, a damaged cache, or an ``out`` with a benchmark that this one would not contain.
+            data, a damaged cache, or an ``out`` with a benchmark that holds more than this one.
     """
     require_models(models)
     dataset = open_store(store)
@@ -115,7 +115,7 @@ def benchmark(
         ]
         done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
         started = time.monotonic()
-        # Models differ too much for one estimate where each tells its own.
+        # Models differ too much for one common estimate: each gives its own, unless the work runs elsewhere.
         of = len(jobs) if places.elsewhere else 0
         for (name, fold, *_), (record, heights) in progress(
             done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of, at_once=workers
@@ -185,7 +185,7 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[PrintedScan]) -> None:
-    """A benchmark may be made again or extended; one with more in it is not replaced."""
+    """Refuse to replace a benchmark that holds more; one may be made again or extended."""
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)

@@ -43,23 +43,23 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    The locked scans are kept for models of these prints: one that was trained on them, in this store or in
-    another one built from the same raw files, is not scored on the locked ones unless asked for. Locked are
-    those of this store and those that were when the model was made. A model of other prints is scored on
-    all scans. The result says which were locked, and whether any was scored.
+    A model of these prints, trained on this store or on another one built from the same raw files, is not
+    scored on locked scans unless ``open_lock_box`` asks for it. Locked are the scans that this store locks
+    and those that were locked when the model was made. A model of other prints is scored on all scans. The
+    result says which scans were locked, and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances that a scan is freed of; ``offset`` by default, for films ``none``.
-        background: ``training`` by default, for films ``none``: whether the background in the model's card is
-            added to the predictions; a card without
-            one, or with one of fields of another size, adds none, and the result says so.
+        policy: nuisances to remove from each scan; ``offset`` by default, for films ``none``.
+        background: ``training`` adds the background in the model's card to the predictions (the default), and
+            ``none`` does not (the default for films). A card without a background, or with one for fields of
+            another size, adds none, and the result says so.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
-        scan_ids: exactly these scans, locked ones among them too.
+        scan_ids: score exactly these scans, even locked ones.
         extrapolate: accept layouts beyond the model's calibrated range.
-        open_lock_box: score the locked scans also of the prints that the model was trained on.
+        open_lock_box: also score the locked scans of the prints that the model was trained on.
 
     Raises:
         InputError: a model or store that cannot be read, geometries that differ, or a noise analysis of

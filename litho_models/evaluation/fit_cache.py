@@ -1,4 +1,4 @@
-"""Where a benchmark keeps its fits: what each predicted of its held-out scans, its record, its diagnostics.
+"""Where a benchmark keeps its fits: for each its predictions of held-out scans, record and diagnostics.
 
 Each (model, fold) is a folder of its own, named by the hash of everything that decides it.
 """
@@ -31,11 +31,11 @@ from litho_models.splits.folds import Fold
 
 
 class FitDiagnostics(Record):
-    """One fitted model on its own scans and on those held out.
+    """Errors of one fitted model on its own scans and on those held out.
 
-    The three errors are comparable, which shows over-fitting: the mean over scans of the datum-free error of
-    policy ``offset``, without a background. ``inner_validation_nm`` is None for fits without it.
-    ``measurement``: learned with the model, for fits that were freed of it.
+    All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
+    that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
+    ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
     """
 
     background: Background
@@ -60,7 +60,7 @@ def diagnose(
     Args:
         model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
         held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
-        measured: also learn the measurement model beside it.
+        measured: also learn the measurement model from the model's residuals.
     """
     heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
 
@@ -80,10 +80,10 @@ def diagnose(
 
 
 def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileDifference | None:
-    """Difference between a scan's field and a crop of it that lacks a third of the rows and columns.
+    """Difference of predictions in a scan's field and in a crop of it without a third of rows and columns.
 
-    Pixels within the receptive radius of the crop's edge are not compared, nor those within one tile
-    of a model on tiles. None for fields too small to leave any, and for models with effects behind them.
+    Pixels closer to the crop's edge than the receptive radius, or than one tile for a model on tiles, are
+    not compared. None for fields too small to leave any pixel, and for models followed by effects.
     """
     if not isinstance(model, Simulator):
         return None
@@ -96,7 +96,7 @@ def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileDifferenc
 
 
 def device_of(model: torch.nn.Module) -> str:
-    """Where a model's weights are, as torch names it."""
+    """The device of a model's weights, as torch names it."""
     return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
 
 
@@ -104,9 +104,9 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(Record):
-    """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
+    """One fit: what it saw and what it cost; errors in nm, None if the model has no rounds.
 
-    ``at_bounds`` are fitted values on a bound of their range, and that bound.
+    ``at_bounds`` maps each fitted value on a bound of its range to that bound.
     """
 
     model: str
@@ -127,11 +127,11 @@ class FitRecord(Record):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """One fit and its heights (ny, nx) of the held-out scans, µm; made only if the cache has none.
+    """One fit and its heights (ny, nx) of the held-out scans, µm; fitted only if it is not in the cache.
 
     Args:
-        measured: fit once more to the training scans freed of what the measurement model learns beside the
-            first fit, and learn it again beside the second.
+        measured: learn the measurement model from a first fit, fit again to the training scans freed of it,
+            and learn it again from the second fit.
 
     Raises:
         InputError: a kept fit that cannot be read.
@@ -150,7 +150,7 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Training scans without what they share beside their prints, as the model predicts those."""
+    """Training scans freed of the measurement model that is learned with this model's predictions."""
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -159,7 +159,7 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """What a fit expects of a scan: its height (ny, nx), µm, and what its training scans add to theirs."""
+    """What a fit expects of a scan: the print (ny, nx), µm, and what its training scans have in common."""
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
 _SD_95 = 1.96
-# Of a row with a model: x, and one or two y.
+# Maps a row of a model to x and one or two y.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
@@ -70,7 +70,7 @@ def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
     panels = len(residuals_um) + 1
     columns = min(4, panels)
     rows = -(-panels // columns)
-    # Beside the panels, two scales.
+    # Room for two colour scales beside the panels.
     figure = new_figure(2.7 * columns + 1.8, 2.9 * rows)
     first, *others = figure.subplots(rows, columns, squeeze=False).flat
     extent = (0, scan.shape[1] * scan.pitch_um, scan.shape[0] * scan.pitch_um, 0)
@@ -144,7 +144,7 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 def loss_curves(fits: Sequence[FitRecord]) -> Figure:
     """Training error (solid) and inner-validation error (dashed) of every fit with rounds."""
-    label = "MAE, nm (solid: training, nuisances out;\ndashed: inner validation, datum-free)"
+    label = "MAE, nm (solid: training, nuisances removed;\ndashed: inner validation, datum-free)"
     lines: Lines = lambda fit: [fit.steps, fit.training_mae_nm, fit.validation_mae_datum_free_nm]  # noqa: E731
     return _curves(fits, "optimiser steps", {label: lines})
 

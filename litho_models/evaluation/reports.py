@@ -47,7 +47,7 @@ def write_evaluation_report(
     _numbers(page, result, [scores])
     page.table(
         [result.model],
-        "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
+        "How the same pixels change in another crop; what predicting a scan cost on this machine.",
         "model.csv",
         columns=("name", "parameters", *_OF_PREDICTION),
     )

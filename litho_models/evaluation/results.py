@@ -82,7 +82,7 @@ class ScoredResult:
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     """Datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
 
-    Two benchmarks are compared model by model; an evaluation stands for its one model. A negative
+    Two benchmarks are compared model by model; an evaluation has one model. A negative
     difference means that the first is better.
 
     Raises:
@@ -113,7 +113,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def read_scored(path: str | Path) -> ScoredResult:
-    """Read a benchmark or an evaluation; a folder stands for the result inside it.
+    """Read a benchmark or an evaluation; of a folder, the result inside it.
 
     Raises:
         InputError: neither of the two.

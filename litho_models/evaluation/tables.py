@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# One mapping a row, column to value.
+# One mapping per row, from column to value.
 Rows = list[dict[str, Any]]
 
 
 def headline_table(
     scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
 ) -> pd.DataFrame:
-    """One row per model: both errors with intervals, what they have above the noise floor, spread and bias.
+    """One row per model: both errors with intervals, their excess over the noise floor, spread and bias.
 
-    Below them the floor itself, under each column that of its own scan terms. Of films the errors of edges
-    and features.
+    The last row is the floor itself, in each column for the scan terms of that column. Films have errors of
+    edges and features instead.
     """
     import pandas as pd
 
@@ -73,7 +73,7 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """One row per model and background, one column per policy; for line offsets the effective number.
+    """One row per model and background, one column per policy; for line offsets also the number of terms.
 
     The last row is the noise floor under each.
     """

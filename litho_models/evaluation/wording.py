@@ -6,12 +6,12 @@ from litho_data.reports.page import filled
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scoring.records import ModelScores
 
-# What counts as more than chance: an interval without zero, and sign flips of the independent units below.
+# A difference is more than chance if its interval excludes zero and its sign-flip p is at most this.
 _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Which model predicts best, by how much, whether that is more than chance, and what noise leaves.
+    """Which model predicts best, by how much, whether that is more than chance, and how much is noise.
 
     A difference is judged over prints where there are several.
     """
@@ -23,7 +23,7 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """How far the model is off on scans, what of it the zero height is, and what noise leaves."""
+    """How far the model is off on scans, how much of that is the zero height, and how much is noise."""
     return _verdict(result, result.scores)
 
 

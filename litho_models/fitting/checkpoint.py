@@ -42,7 +42,7 @@ class TrainingState:
         return self.history[-1].step if self.history else 0
 
     def record(self, record: RoundRecord) -> None:
-        """Add a round; keep the weights where it is the best, or where there is nothing to judge by."""
+        """Add a round; keep its weights if it is the best, or if no round has a validation error."""
         errors = [entry.validation_mae_datum_free_nm for entry in self.history]
         error = record.validation_mae_datum_free_nm
         if error is None or all(one is None or error < one for one in errors):
@@ -57,7 +57,7 @@ class TrainingState:
         """Write weights, best weights and moments."""
         buffer = BytesIO()
         torch.save((self.model.state_dict(), self.best, self.optimiser.state_dict()), buffer)
-        # Not by torch itself, whose error on a full disk is no OSError.
+        # Not written by torch itself, which raises no OSError on a full disk.
         file.write_bytes(buffer.getvalue())
 
     def load(self, file: Path, history: list[RoundRecord]) -> None:

@@ -12,12 +12,12 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
-# The steps of a default PBL train its chain, on which the feature networks then build: no long training, and
-# no scan is spent on choosing between its rounds.
+# In a default PBL the steps train only the chain, which the feature networks then correct: a short training
+# is enough, and no scan is spent on choosing between its rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # What a fit by least squares depends on.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance", "free_gain"}
-# Nothing real needs more of anything, and beyond it sums lose digits or overflow.
+# Upper limit of all counts: no real case needs more, and beyond it sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
@@ -40,11 +40,11 @@ class TrainingConfig(BaseModel):
         4,
         ge=1,
         le=_MOST,
-        description="times that nuisances are re-estimated, validation runs, a checkpoint is kept",
+        description="rounds; after each, nuisances are re-estimated and a checkpoint is kept",
     )
     batch: int = Field(4, ge=1, le=_MOST, description="crops per step")
     crop_px: int = Field(
-        128, ge=8, le=_MOST, description="scored width and height of a crop; a model with tiles takes its own"
+        128, ge=8, le=_MOST, description="scored width and height of a crop; a model on tiles uses its tile"
     )
     crops: Literal["random", "quadrants"] = "random"
     optimiser: Literal["adamw", "adam"] = "adamw"
@@ -95,7 +95,7 @@ class TrainingConfig(BaseModel):
     def takes_steps(self, model: Simulator) -> bool:
         """Whether the model is trained by stochastic gradient rather than by least squares.
 
-        One with many parameters is, unless it is linear in them; a small one where the paper trains it so.
+        Large models are, unless they are linear in their parameters; small ones only if the paper does so.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)

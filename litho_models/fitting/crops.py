@@ -10,7 +10,7 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# What a network remembers of a crop for its gradient is hundreds of bytes per pixel.
+# For its gradient a network keeps hundreds of bytes per pixel of a crop.
 _PASS_PX = 256**2
 
 
@@ -65,8 +65,8 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
     """The windows of a step in groups that go through the network one after the other.
 
-    On a CPU as many as have ``_PASS_PX`` pixels together, one at least, which bounds the memory and costs no
-    time; elsewhere all at once.
+    On a CPU a group has at most ``_PASS_PX`` pixels, or one window, which bounds the memory and costs no
+    time; elsewhere all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":

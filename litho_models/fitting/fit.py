@@ -26,13 +26,13 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# Closed form and close to the data: from it a network gets its first scan terms.
+# Fitted in closed form and close to the data: it gives a network its first scan terms.
 FIRST_MODEL = "linear"
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fitted model and how it came about; ``history`` is empty for models without rounds."""
+    """A fitted model and how it was fitted; ``history`` is empty for models without rounds."""
 
     model: Simulator
     training_ids: list[str]
@@ -79,7 +79,7 @@ def fit_with_record(
             f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
         )
     model = build_model(model_name, config.variant, **geometry, **fields)
-    # Also for a model that leaves no checkpoint: the folder may hold another's.
+    # Checked even for a model that writes no checkpoint: the folder may hold another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
@@ -104,7 +104,7 @@ def fit_with_record(
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
         history=history,
-        # Also what was done before a kill.
+        # Includes the time before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
     )
 
@@ -114,7 +114,7 @@ def fit_in_cache(
 ) -> Fitted:
     """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
 
-    Benchmark and loop that train the same model on the same scans find each other's work there.
+    A benchmark and a loop that train the same model on the same scans reuse each other's fits there.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"

@@ -1,8 +1,8 @@
-"""One least squares for small models: damped Gauss-Newton with the terms of single scans solved for beside.
+"""Least squares for all small models: damped Gauss-Newton that also solves for the terms of single scans.
 
 The loss is a sum of squares, or of absolute values by reweighting: weights 1/sqrt(r² + δ²) turn squares into
-absolute values. What is fitted (a model of the zoo, or the loop's model with effects) and how its derivatives
-are had is the problem's own business; where it may go is the problem's ``room``.
+absolute values. The problem supplies what is fitted (a model of the zoo, or the loop's model with effects),
+its derivatives, and the ``room`` in which the parameters may move.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Problem(Protocol):
         """Measured minus predicted (n,) of all scans, µm."""
 
     def room(self, vector: Array) -> Room | None:
-        """Smallest and largest step (p,) allowed from here; None where any is."""
+        """Smallest and largest step (p,) allowed from here; None if any step is."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class Rules:
 
     Attributes:
         loss: what is minimised.
-        term_weight: weight left to what the scans may add by themselves, with ``squares``: enough to fix what
-            only these terms carry (the common datum), too little to let one scan pull the parameters.
+        term_weight: with ``squares``, weight of residuals that the scans' own terms can explain: enough to
+            fix what only these terms carry (the common datum), too little for a scan to pull the parameters.
         pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
-        steps: at most so many; ``relative_gain``: a smaller gain of one step ends the fit.
-        tries: of a step, each with ten times the damping; ``lowest_damping``: never less than this.
+        steps: largest number of steps; ``relative_gain``: a smaller gain of one step ends the fit.
+        tries: attempts at one step, each with ten times the damping; ``lowest_damping``: its lower limit.
         kept_above: derivatives are kept while a step gains this share of what they promise; None: never.
     """
 
@@ -91,7 +91,7 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown``: counts the steps."""
+    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` wraps their range."""
     vector, linear = start, problem.linearise(start)
     if not len(start):
         return LeastSquaresFit(vector, linear, [])
@@ -118,7 +118,7 @@ def fit_least_squares(
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
         small = gained < rules.relative_gain * loss
-        # Only derivatives taken here can tell that no larger step is left.
+        # Only derivatives computed at this point can show that no larger step is left.
         ends = small and fresh
         if rules.kept_above is None:
             kept = False
@@ -136,7 +136,7 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Parameters first, then the terms of each scan, then the rows that pin the leading ones.
+    """Rows of the parameters first, then of the terms of each scan, then those that pin leading terms.
 
     With ``squares`` the terms of the scans are eliminated and only the parameters are left.
     """
@@ -202,12 +202,12 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """What a step (p,) takes from the squares of normal equations (p, p), (p,) if the problem is linear."""
+    """By how much a step (p,) lowers the squares of normal equations (p, p), (p,), if these are exact."""
     return float(2 * right @ step - step @ matrix @ step)
 
 
 def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[Linearised]:
-    """All scans with these residuals (n,), µm, and the derivatives that they have."""
+    """All scans with new residuals (n,), µm, and unchanged derivatives."""
     return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
@@ -225,7 +225,7 @@ def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Ar
 
 
 def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
-    """Sum of squares of residuals (n,) of these scans, their own terms weighted down."""
+    """Sum of squares of residuals (n,) of these scans, with what their own terms explain weighted down."""
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
         for r, part in zip(residuals, linear, strict=True)
@@ -235,8 +235,8 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
     """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
 
-    A step that is cut to its bounds afterwards would leave the other parameters where only the uncut
-    step was best, and a fit whose optimum lies on a bound would creep; inside the box they follow.
+    If a step were cut to its bounds afterwards, the other parameters would still fit the uncut step, and a
+    fit whose optimum lies on a bound would creep; minimised inside the box, they adapt.
 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).
@@ -252,7 +252,7 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
         return step
     factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
     target = np.linalg.solve(factor, right / scale)
-    # lsq_linear wants room between the bounds; a parameter without any stays where it is.
+    # lsq_linear needs distinct bounds; a parameter without room stays where it is.
     width = np.maximum(room[1] - room[0], 1e-12)
     box = (room[0] * scale, (room[0] + width) * scale)
     return lsq_linear(factor.T, target, box, method="bvls").x / scale

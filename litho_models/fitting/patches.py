@@ -1,4 +1,4 @@
-"""Patches of a store for training loops of one's own: PyTorch's ``Dataset``, the lock box left out."""
+"""Patches of a store for your own training loop: a PyTorch ``Dataset`` without the lock box."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ Flips = Literal["none", "y", "x", "both"]
 
 
 class Patch(TypedDict):
-    """One patch: layout with its margin, measured height and what of it counts; its scan and corner."""
+    """One patch: layout with its margin, measured height and which pixels count; its scan and corner."""
 
     layout_um: Tensor
     height_um: Tensor
@@ -39,10 +39,10 @@ class PatchDataset(Dataset[Patch]):
     Args:
         store: dataset store or its path. Locked scans are left out.
         size_px: side s of a patch; ``margin_px``: m.
-        per_scan: patches of each scan.
+        per_scan: number of patches from each scan.
         ids: scans to draw from; all that are not locked by default.
         flips: axes along which half of the patches are reversed, at random.
-        seed: of the places and flips.
+        seed: decides places and flips.
 
     Raises:
         InputError: unknown or locked ids, or a patch that is larger than a scan.
@@ -67,7 +67,7 @@ class PatchDataset(Dataset[Patch]):
             raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the smallest scan")
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
-            raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one a scan")
+            raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one per scan")
         self.size_px, self.margin_px, self.per_scan = size_px, margin_px, per_scan
         self.flips, self.seed = flips, seed
 

@@ -1,4 +1,4 @@
-"""Networks of fixed features, fitted to single pixels: their features are made once for each scan."""
+"""Networks of fixed features, fitted to single pixels: features are computed once for each scan."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
-# Pixels of all scans together, on a square grid in each: 100 MB of features.
+# Fitted pixels of all scans together, on a square grid in each: 100 MB of features.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
 # Passes over all pixels after which the terms of the scans are estimated anew.
@@ -28,7 +28,7 @@ EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """Of one scan: features (n, all), what is measured beyond the chain (n,) µm, and its own terms (m, n)."""
+    """One scan: features (n, all), measured height minus the chain's (n,) µm, and its own terms (m, n)."""
 
     features: Tensor
     rest_um: FloatMap
@@ -38,13 +38,13 @@ class _Pixels(NamedTuple):
 def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
-    """Fit the feature networks of ``model`` in place, to the mean absolute error of what its chain leaves.
+    """Fit the feature networks of ``model`` in place, by mean absolute error, to the chain's residual.
 
     Offsets of lines are left out of the terms of the scans, as they average out.
 
     Returns:
-        the round, its error with the terms of the scans taken out; ``validation`` scans change
-        nothing.
+        the record of one round, with the error after the terms of the scans are removed; ``validation``
+        scans do not influence the fit.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance, config.free_gain)
@@ -95,7 +95,7 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """What the networks are to add at all pixels, (all n,) µm: the terms of the scans taken out."""
+    """What the networks should add at all pixels, (all n,) µm, the terms of the scans removed."""
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]
     own = np.array([least_squares(part.terms, rest) for part, rest in zip(parts, rests, strict=True)])

@@ -14,18 +14,18 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Relative to the mean square of each feature, what scans may add taken out: only what the scans cannot tell
-# apart feels it. On the measured prints nothing changes from 1e-6 to 1e-4.
+# Relative to the mean square of each feature, the scans' own terms removed: it only affects weights that the
+# scans cannot tell apart. On the measured prints all values from 1e-6 to 1e-4 give the same.
 RIDGE = 1e-5
-# Pixels of a scan that are fitted, on a square grid: with twice as many the measured prints are predicted
-# alike. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept while all together take no more than
-# KEPT_BYTES, and made again in each pass otherwise; beside them there are the maps of one tile (0.3 GB).
+# Fitted pixels of each scan, on a square grid: twice as many predict the measured prints equally well. The
+# rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take at most KEPT_BYTES,
+# and computed again in each pass otherwise; the maps of one tile take another 0.3 GB.
 FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
 # The first pass minimises squares; the second reweights them to absolute values, so that blobs weigh little.
 PASSES = 2
-# Of what the scans may add by themselves: fixes what only these terms carry, the common datum.
+# Weight of the scans' own terms: fixes what only these terms carry, the common datum.
 _TERM_WEIGHT = 1e-3
 
 
@@ -96,7 +96,7 @@ def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap
 
 
 def _standardise(model: RandomFeatures, scans: Sequence[PrintedScan]) -> None:
-    """Measure what the random features see: mean over all scans, spread within them."""
+    """Standardise the inputs of the random features: mean over all scans, spread within them."""
     count = len(model.centre)
     seen = [feature_rows(model, scan, grid_pixels(scan, FITTED_PX))[:count] for scan in scans]
     centre = np.mean([one.mean(axis=1) for one in seen], axis=0)

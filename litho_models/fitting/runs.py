@@ -87,7 +87,7 @@ def train(
         "config": config.model_dump(mode="json"),
         "lock_box": locked,
     }
-    # Under torchrun the first process writes.
+    # Under torchrun only the first process writes.
     first = int(os.environ.get("RANK", "0")) == 0
     with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
         if first:
@@ -135,7 +135,7 @@ def train(
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """The settings of a recipe, checked; those that are none of a training are the model's.
+    """The checked settings of a recipe; those that training does not know go to the model.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.

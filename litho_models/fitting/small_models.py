@@ -18,11 +18,11 @@ from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
-# A small model needs no more than a quarter of each scan: another quadrant from scan to scan.
+# A quarter of each scan is enough for a small model; the quadrant changes from scan to scan.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Parameters are heights in µm and raw numbers of ranges: one step beyond a unit would leave the range in
-# which the linearisation means anything.
+# Parameters are heights in µm and raw numbers of ranges: a step of more than one unit would leave the
+# region in which the linearisation is valid.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
@@ -35,7 +35,7 @@ def fit_small_model(
     Line offsets of ``full+rows`` are left out: they average out over a scan and cannot move a small model.
 
     Returns:
-        mean absolute residual after each step, µm, the terms of the scans taken out.
+        mean absolute residual after each step, µm, the terms of the scans removed.
     """
     if not any(parameter.requires_grad for parameter in model.parameters()):
         return []
@@ -48,7 +48,7 @@ def fit_small_model(
 
 
 class ModelProblem:
-    """A model on windows of scans; works on a copy of the model of its own.
+    """A model on windows of scans; it works on its own copy of the model.
 
     Args:
         model: the model; ``scans``: what it is fitted to; ``terms``: what each may add.
@@ -70,7 +70,7 @@ class ModelProblem:
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
     def room(self, vector: Array) -> Room | None:
-        """Within the ranges of the model; a linear one may go anywhere at once."""
+        """Steps within the ranges of the model; a linear model may take any step."""
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
@@ -105,7 +105,7 @@ class _Sample:
         self._expansion: tuple[Array, Array, Array] | None = None
 
     def linearise(self, model: Simulator, terms: Terms) -> Linearised:
-        """The scan at the model as it is; a linear model is differentiated once."""
+        """The scan, linearised at the model's present values; a linear model is differentiated once."""
         if model.is_linear and self._expansion is not None:
             height, jacobian = self.height_um(model), self._expansion[2]
         else:

@@ -51,7 +51,7 @@ def train_network(
 
     Without validation scans the last round counts. ``first_predictions_um`` makes the
     heights of a small model on the training scans, from which the first scan terms are estimated; a run
-    that continues has no need of it.
+    that continues does not call it.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -99,7 +99,7 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Steps up to ``last``; InputError where they lead to numbers that are none, whatever fails then."""
+    """Run steps up to ``last``; InputError if numbers become infinite or NaN, whatever fails then."""
     try:
         yield
         error = None
@@ -114,7 +114,7 @@ def _diverging(model: Simulator, last: int) -> Iterator[None]:
 def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
-        got=f"weights or errors that are no numbers at step {step}",
+        got=f"weights or errors that are not finite at step {step}",
         wanted="steps that converge",
         hint="try a smaller learning_rate",
     )
@@ -138,7 +138,7 @@ class _Targets:
 
 
 class _Heights(nn.Module):
-    """Heights of crops as training wants them, in one module: processes share the gradients of its forward.
+    """Heights of crops for training, as one module, because processes share the gradients of one module.
 
     Random crops come with their surroundings (``margin_px``) or are one tile of the model; quadrants are
     images of their own. Layouts and heights are float32 whatever the precision within.
@@ -154,7 +154,7 @@ class _Heights(nn.Module):
 
     @property
     def margin_px(self) -> int:
-        """Pixels around a crop; a blur that learns its width needs more or fewer as it goes."""
+        """Pixels around a crop; they change in training if a blur learns its width."""
         return (self.model.reach_px or 0) if self._inside else 0
 
     def forward(self, layout_um: Tensor) -> Tensor:
@@ -171,12 +171,12 @@ def _step(
     config: TrainingConfig,
     step: int,
 ) -> Tensor:
-    """One step; the weighted absolute error, µm, and the weight, (2,), which a GPU may still be computing."""
+    """Do one step; return (2,): weighted absolute error, µm, and weight; a GPU may still be computing it."""
     for group in optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
     own = batch[fabric.global_rank :: fabric.world_size]
-    # A process without a crop takes part in the sum of gradients with one that does not count.
+    # A process without a crop of its own joins the sum of gradients with one of weight 0.
     passes = in_passes(own or batch[:1], fabric.device)
     optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=fabric.device)
@@ -212,7 +212,7 @@ def _crops(
     fabric: Fabric, fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0
 ) -> Tensor:
     crops = stack(fields, windows, margin_px)
-    # From pinned memory a copy to a GPU waits for nothing that the GPU is still doing.
+    # A copy from pinned memory does not wait for the GPU's running work.
     on_device: Tensor = fabric.to_device(crops.pin_memory() if fabric.device.type == "cuda" else crops)
     return on_device
 

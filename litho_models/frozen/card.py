@@ -20,10 +20,10 @@ CARD_FILE = "card.json"
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
-# Whose an effect of undetermined role is taken to be.
+# The side to which an effect of undetermined role is attributed.
 Attribution = Literal["printer", "microscope"]
 
-# Lists that are looked up in `training` and `split`, which hold free facts otherwise.
+# Lists that are looked up in `training` and `split`; everything else there is free-form.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
@@ -52,11 +52,11 @@ class ModelCard(RunFacts, Result):
     """All that is needed to load, use and judge a frozen model.
 
     ``background`` is what the microscope added to the training scans on average; only a comparison with
-    measured maps uses it, the model's height never contains it. ``at_bounds`` are fitted values on a bound of
-    their range, and that bound. ``baseline``: the figures (``ScanFigures``) of the scans that the model was
-    made of, with which ``litho-models check`` compares new prints. ``attributed`` says whose an effect of
-    undetermined role was taken to be when the model was frozen; older cards list those of the printer in
-    ``declared_processes``.
+    measured maps uses it, the model's height never contains it. ``at_bounds`` maps each fitted value on a
+    bound of its range to that bound. ``baseline``: the figures (``ScanFigures``) of the scans that the model
+    was made of, with which ``litho-models check`` compares new prints. ``attributed`` says to which side each
+    effect of undetermined role was attributed when the model was frozen; older cards list those of the
+    printer in ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -141,6 +141,6 @@ class ModelCard(RunFacts, Result):
 
 
 def bounds_text(at_bounds: dict[str, float]) -> str:
-    """What it means that fitted values stand on their bounds."""
+    """Explain that fitted values lie on their bounds."""
     named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
     return f"On a bound of its range, so that the fit may want more than the model allows: {named}."

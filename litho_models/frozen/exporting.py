@@ -37,11 +37,11 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
 
     Args:
         out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
-        size_px: of the layout, one number or (y, x).
+        size_px: side of the layout, or (y, x).
 
     Raises:
-        InputError: another suffix; no ``onnx``; a model whose operations the format does not have; one that
-            would print something else.
+        InputError: another suffix; no ``onnx``; a model whose operations the format does not have, or
+            whose program would predict other heights.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:
@@ -68,7 +68,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
 
 
 def _in_plain_operations(simulator: nn.Module) -> nn.Module:
-    """A copy whose networks run layer by layer: a program has no place for the compiled stack."""
+    """A copy whose networks run layer by layer: a program cannot contain the compiled stack."""
     plain = copy.deepcopy(simulator).float().cpu().eval().requires_grad_(False)
     for module in plain.modules():
         activation = getattr(module, "activation", None)
@@ -78,7 +78,7 @@ def _in_plain_operations(simulator: nn.Module) -> nn.Module:
 
 
 class _LeakySteps(nn.Module):
-    """A leaky ReLU that no fast path knows."""
+    """A leaky ReLU that no fast path recognises."""
 
     def __init__(self, slope: float):
         super().__init__()
@@ -89,10 +89,10 @@ class _LeakySteps(nn.Module):
 
 
 class _Numbers(TorchDispatchMode):
-    """What a model takes out of tensors as Python numbers: noted in one run, or told in another.
+    """Python numbers that a model reads from tensors: recorded in one run, replayed in another.
 
-    Kernels have radii that follow from widths, and tables have ends. They follow from the weights alone, so a
-    program may hold them as constants.
+    They are the radii of kernels, which follow from widths, and the ends of tables. Both follow from the
+    weights alone, so a program may hold them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):
@@ -120,7 +120,7 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
             simulator(layout)
         noted.append(numbers.noted)
     if noted[0] != noted[1]:
-        raise InputError("model to export", got="steps that depend on the layout", wanted="the same for all")
+        raise InputError("model to export", got="steps that depend on the layout", wanted="fixed steps")
 
     def run(layout_um: Tensor) -> Tensor:
         with _Numbers(noted[0]):

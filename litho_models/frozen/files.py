@@ -49,7 +49,7 @@ def save_frozen(
         name: name in reports; the model's own by default.
         process_effects: effects of the printer that are part of the model, name to parameter values.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); those that follow
-            from the model are found anew.
+            from the model are derived again.
 
     Raises:
         InputError: weights that are not finite or not float32, or unknown card fields.
@@ -188,7 +188,7 @@ def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
 
 
 def _check_effects(card: ModelCard) -> None:
-    """Refuse process effects that are none, or whose values no printer has."""
+    """Refuse names that are no process effects, and values that no printer can have."""
     from litho_models.effects import get_effect
 
     for name, values in card.process_effects.items():

@@ -11,7 +11,7 @@ from litho_models.frozen.files import load_simulator, save_frozen
 
 # Where `train` and `close-loop` leave their model within the run folder.
 MODEL_FOLDER = "model"
-# The part of a model that `Simulator.printer` leaves out, among the effects of undetermined role.
+# Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
     f"Stated errors are those with {SCAN_AXIS}, which belongs to measured maps and is left out here."
@@ -26,13 +26,13 @@ def freeze(
     Args:
         source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
         out: folder of the frozen model.
-        attribute: whose the effects of undetermined role are taken to be, of all of them or by name:
+        attribute: the side to which effects of undetermined role are attributed, one for all or by name:
             those of the printer become part of the model, those of the microscope do not. The card says so.
-            ``scan-axis`` is what a base model itself adds along the lines of the scan.
+            ``scan-axis`` is the part of a base model that acts along the lines of the scan.
 
     Raises:
-        InputError: no model there, an effect that is not among the undetermined ones, or another side; or
-            ``scan-axis`` for the printer, of a model that was frozen without it.
+        InputError: no model there, an effect that is not among the undetermined ones, an unknown side, or
+            ``scan-axis`` attributed to the printer in a model that was frozen without it.
     """
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER

@@ -42,7 +42,7 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
 
 @contextmanager
 def _hub(repository: str) -> Iterator[Any]:
-    """The library, whose errors become one line."""
+    """The library; each of its errors becomes one line."""
     what = f"model {ADDRESS}{repository}"
     if not _REPOSITORY.fullmatch(repository):
         raise InputError(what, wanted=f"{ADDRESS}OWNER/NAME")
@@ -52,6 +52,6 @@ def _hub(repository: str) -> Iterator[Any]:
         raise InputError(what, got=f"no {error.name}", hint="pip install 'litholoop[hub]'") from None
     try:
         yield huggingface_hub
-    # Its own errors, and those of whichever library it speaks to the network with.
+    # Its own errors, and those of whatever network library it uses.
     except Exception as error:
         raise InputError(what, got=str(error).strip().partition("\n")[0]) from error

@@ -62,9 +62,9 @@ def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
 def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """The scans of a store that were locked when the model was made, by their raw files.
 
-    Another recipe or registration changes every height of a store, a scan more or less the box that it
-    draws, but neither changes a raw file. A card that lists no files locks the ids of its box in a dataset of
-    the same name.
+    Another recipe or registration changes every height of a store, and an added or missing scan changes which
+    scans it locks, but neither changes a raw file. If a card lists no files, the ids of its lock box are
+    locked in a dataset of the same name.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

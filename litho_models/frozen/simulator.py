@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
+# Rounded to float32, the highest level may exceed the range a little; the next one exceeds it by 100 nm.
 _ROUNDING_UM = 1e-5
 
 
@@ -57,7 +57,7 @@ class FrozenSimulator(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model that answers differently for another image size; None for all others."""
+        """The tile of a model whose result depends on the size of the image; None for all others."""
         return self.simulator.tile
 
     @contextmanager
@@ -125,8 +125,8 @@ class FrozenSimulator(nn.Module):
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
         """As ``forward`` without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border) µm.
 
-        Of a border at least as wide as the receptive radius, or of a model on tiles, only what the rest needs
-        is computed. In the first case nothing is assumed beyond the edge of the layout.
+        With a border at least as wide as the receptive radius, or with a model on tiles, only what the result
+        needs is computed. In the first case nothing is assumed beyond the edge of the layout.
 
         Raises:
             InputError: as ``forward``, or a border that leaves nothing.
@@ -201,7 +201,7 @@ Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
 
 
 def predict_layout(model: nn.Module, layout_um: Field, *, pitch_um: float, level_height_um: float) -> Field:
-    """What ``FrozenSimulator.predict`` promises, of a model of that pitch and level height."""
+    """Do what ``FrozenSimulator.predict`` does, for a model of that pitch and level height."""
     if isinstance(layout_um, Tensor):
         return _predict_tensor(model, layout_um, level_height_um)
     if isinstance(layout_um, np.ndarray):
@@ -233,7 +233,7 @@ def _predict_tensor(model: nn.Module, layout_um: Tensor, level_height_um: float)
         raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), none of them 0")
     dtype = next((weight.dtype for weight in model.parameters()), layout_um.dtype)
     fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
-    # One after the other: a stack takes the memory of one field.
+    # One field after the other, so that a stack needs no more memory than one field.
     return torch.cat([model(field) for field in fields]).reshape(layout_um.shape)
 
 

@@ -1,4 +1,4 @@
-"""Frozen models that come with the package, those of the benchmark's table: their names and folders.
+"""Names and folders of the frozen models that come with the package, those in the benchmark's table.
 
 ``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
 """
@@ -43,7 +43,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
     Args:
         source: what the user typed.
-        other: names that the caller takes besides, for the message.
+        other: further names that the caller accepts, for the message.
 
     Raises:
         InputError: no such folder, no such model in the zoo, or one that cannot be fetched.

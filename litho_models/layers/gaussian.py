@@ -18,13 +18,13 @@ SUPPORT_SIGMAS = 4.0
 # A narrower Gaussian has no weight left on the next pixel (exp(-50)); it also keeps 1/sigma finite.
 _SMALLEST_SIGMA_PX = 0.1
 # Pixels of a block; the wider one serves radii of 64 px and more. Wider blocks multiply more zeros of the
-# band, narrower ones are slower products.
+# band; narrower ones multiply more slowly.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 # Wider than any field that is printed; a wider one would take the memory of a machine.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
-# How far a kernel reaches: four sigma, or three times the whole pixels of one (the authors' code).
+# Radius of a kernel: four sigma, or three times sigma cut to whole pixels (the authors' code).
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -46,7 +46,7 @@ def gaussian_blur(
             carry gradients.
         pitch_um: sampling of the field, µm.
         edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
-        radius_px: of the kernel on each side; four sigma by default.
+        radius_px: reach of the kernel to each side; four sigma by default.
 
     Raises:
         InputError: a pitch that is not positive, or a field without pixels.
@@ -110,7 +110,7 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Radius of a kernel by the rule of a model, at most ``cap_px`` where there is a cap."""
+    """Radius of a kernel by the rule of a model, limited to ``cap_px`` if that is given."""
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 
@@ -129,7 +129,7 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 class _Blur(torch.autograd.Function):
     """One axis (-1 or -2) of samples (s, y, x) blurred by a band of one symmetric kernel; linear in both.
 
-    PyTorch's own way back through windows that overlap takes three times as long.
+    PyTorch's own backward pass through overlapping windows takes three times as long.
     """
 
     generate_vmap_rule = True
@@ -160,7 +160,7 @@ class _Blur(torch.autograd.Function):
         band, samples = ctx.saved_tensors
         axis, of_samples, of_band = ctx.axis, None, None
         if ctx.needs_input_grad[0]:
-            # The kernel is symmetric: the way back is the same blur, of zeros around the gradient.
+            # The kernel is symmetric: the backward pass is the same blur, of the gradient padded with zeros.
             reach = band.shape[1] - band.shape[0]
             of_samples = _Blur.apply(_pad_axis(gradient, reach, reach, axis), band, axis)
         if samples is not None:
@@ -179,9 +179,9 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """What the blocks of each sample are made of: (blocks, other axis, pixels of a window), views.
+    """For each sample the windows that its blocks are computed from: (blocks, other axis, window), views.
 
-    One sample at a time: a product would copy the windows of several, which overlap.
+    One sample at a time: windows overlap, and a product over several samples would copy them.
     """
     block, window = band.shape
     count = -(-(samples.shape[axis] - window + block) // block)
@@ -198,7 +198,7 @@ def _band(radius: int, sigma_px: Tensor) -> Tensor:
     """Matrix (block, block + 2 radius) whose row i holds the kernel centred on column i + radius."""
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
-    # All rows are windows on one symmetric kernel with zeros on both sides, the last row's first.
+    # All rows are windows on one symmetric kernel with zeros on both sides; the last row's window is first.
     block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
     kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
     return kernel.unfold(0, block + 2 * radius, 1).flip(0)

@@ -1,4 +1,4 @@
-"""Functions that see each pixel alone, block after block of pixels, so that hidden values stay few."""
+"""Functions of single pixels, evaluated block by block to limit the hidden values in memory."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
-# A hundred hidden values of so many pixels take 3 MB, which stay in the last cache.
+# A hundred hidden values for each of so many pixels take 3 MB, which fit into the last-level cache.
 _PIXELS_AT_ONCE = 2**13
 
 
@@ -19,14 +19,14 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
     Args:
         function: maps features of any number m of pixels, (m, ...) each, to m values, (m,).
         features: (n, ...) each.
-        parameters: what the function holds; gradients flow to those that learn, too.
+        parameters: those of the function; gradients also flow to those that are trained.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
         values: Tensor = _WithSlopes.apply(function, *features)
         return values
     if torch.is_grad_enabled():
-        # Computed again for a gradient: the hidden values of a field would take gigabytes.
+        # Computed again in the backward pass: the hidden values of a field would take gigabytes.
         parts = [checkpoint(function, *block, use_reentrant=False) for block in _in_blocks(features)]
     else:
         parts = [function(*block) for block in _in_blocks(features)]
@@ -34,9 +34,9 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 
 
 class _WithSlopes(torch.autograd.Function):
-    """What is left for the way back are the slopes, found along with the values.
+    """Keep only the slopes for the backward pass, computed along with the values.
 
-    They take as much memory as the features, and no second pass over the pixels.
+    They take as much memory as the features and save a second pass over the pixels.
     """
 
     @staticmethod
@@ -83,8 +83,8 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 class PointwiseNet(nn.Module):
     """A network of one scalar, 1 -> hidden layers -> 1, the same for all pixels (1 x 1 convolutions).
 
-    It is a function of one variable, and a piecewise-linear one; so it is evaluated on ``knots``
-    points and interpolated, which needs a thousand evaluations rather than one per pixel.
+    It is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points
+    and interpolated, which needs a thousand evaluations rather than one per pixel.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):

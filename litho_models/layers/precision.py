@@ -1,4 +1,4 @@
-"""In which precision networks multiply, and whether the processor at hand gains by less of it."""
+"""The precision in which networks multiply, and whether a lower one is faster on this processor."""
 
 import sys
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
-    """Say on stderr, once, that float32 would be faster: in ``precision`` on a CPU without a unit for it."""
+    """Say once on stderr that float32 would be faster, if this CPU has no unit for ``precision``."""
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
         _say("networks in bfloat16: float32 is faster on this processor, which has no bfloat16 unit")
 
@@ -30,7 +30,7 @@ def warn_where_slower(precision: Precision, device_type: str) -> None:
 def has_bfloat16_unit() -> bool:
     """Whether this processor multiplies in bfloat16; without such a unit it is emulated in float32."""
     known = getattr(torch.cpu, "get_capabilities", None)
-    # Older versions of PyTorch cannot tell: then nothing is said against it.
+    # Older versions of PyTorch cannot tell; then the unit is taken to exist.
     return known is None or any(known().get(unit) for unit in _UNITS)
 
 

@@ -1,8 +1,8 @@
-"""Ranges of fitted values, and what it means that one stands on a bound.
+"""Ranges of fitted values, and when a value counts as being on a bound.
 
 A fit moves a raw number; the model uses the value inside its range. Near a bound the value hardly follows the
-raw number any more, and a fit that has run there could not come back. So fits keep raw numbers within
-``FLAT_FROM``, and a value whose raw number is that far out stands on its bound.
+raw number any more, and a fit that went there could not come back. So fits keep raw numbers within
+``FLAT_FROM``, and a value whose raw number has reached that limit counts as being on its bound.
 """
 
 import math
@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# A sigmoid has 7 % of its slope left, and is 2 % of the range away from the bound.
+# There a sigmoid has 7 % of its largest slope and is 2 % of the range away from the bound.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 
@@ -24,7 +24,7 @@ class Range:
     """Range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
 
     Attributes:
-        name: of the value, with its unit.
+        name: name of the value, with its unit.
         lower, upper: its bounds; an infinite ``upper`` takes the softplus.
     """
 
@@ -53,11 +53,11 @@ class Range:
 
     @property
     def raw_ends(self) -> tuple[float, float]:
-        """Smallest and largest raw number that a fit gives."""
+        """Smallest and largest raw number that a fit may reach."""
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """The bound on which a raw number stands; None inside the range."""
+        """The bound that a raw number has reached; None inside the range."""
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
             return self.lower

@@ -15,11 +15,11 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, fit_state, held_out_maps, without_terms
+from litho_models.loop.fits import State, Study, fit_state, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
-from litho_models.loop.search import Cause
+from litho_models.loop.search import Cause, describe, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -34,7 +34,8 @@ class Check:
     """What the causes of a model are checked by.
 
     Attributes:
-        state: the model; ``others``: its causes and laws; ``laws``: all that might stand in a cause's place.
+        state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all that might stand in a
+            cause's place.
         left_nm2: what all features of layout and place still explain beside it.
         secants: of the laws.
     """
@@ -42,15 +43,25 @@ class Check:
     state: State
     others: Sequence[Cause]
     laws: Sequence[Effect]
+    tables: Sequence[Effect]
     left_nm2: float
     secants: Secants
-    study: Study
+
+    @property
+    def laws_in(self) -> list[str]:
+        """The laws of the model."""
+        return [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
+
+    @property
+    def study(self) -> Study:
+        """What the model is fitted to."""
+        return self.state.study
 
     def of(self, cause: Cause) -> Cause:
         """One of the causes, judged with everything else in place."""
-        without = self.state.without(cause.name, self.study)
+        without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
-        reshaped_nm2 = reshaped_gain(without, self.state, self.study)
+        reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
         unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
         larger = "" if unneeded else self._larger(cause, without)
@@ -58,6 +69,8 @@ class Check:
             reason = f"not needed beside the others: {unneeded}"
         elif larger:
             reason = f"may only correct the formula of {larger}"
+        elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
+            reason = f"beside {', '.join(self.laws_in)} it takes less than half of what it took without"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
             reason = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
         # A small part of what is left is the little that any columns take of causes that are still missing.
@@ -77,8 +90,8 @@ class Check:
             if gain_nm2 < 0.1 * other.judgement.gain_nm2:
                 if get_effect(other.name).knowledge == "law":
                     return other.name
-                neither = without.without(other.name, self.study)
-                if reshaped_gain(neither, without, self.study) >= 0.5 * gain_nm2:
+                neither = without.without(other.name)
+                if reshaped_gain(neither, without) >= 0.5 * gain_nm2:
                     return other.name
         return ""
 
@@ -88,7 +101,7 @@ class Check:
         Two laws at most, with no more numbers than the cause has.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
-        state = self.state.without(cause.name, self.study)
+        state = self.state.without(cause.name)
         laws: list[str] = []
         while len(laws) < 2 and (law := self._best_law(state, numbers)):
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
@@ -98,27 +111,41 @@ class Check:
                 return replace(cause, reason=f"short laws do better in its place: {', '.join(laws)}")
         return cause
 
+    def beside_table(self, cause: Cause) -> Cause:
+        """A cause that stands otherwise, held against a table that takes over twice as much in its place.
+
+        Where such a table leaves nothing to the cause, it is a part of something larger without a name.
+        """
+        least_nm2 = 2 * cause.judgement.gain_nm2
+        for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
+            if table.judgement.gain_nm2 > least_nm2:
+                both = with_table(self.state, table)
+                judged = judge(both.without(cause.name).freed_nm2, both.freed_nm2, self.study)
+                if reason := judged.reason(grouped=cause.by != ALL):
+                    return replace(cause, reason=f"{table.name} takes its place, and more: {reason}")
+        return cause
+
     def _best_law(self, state: State, numbers: int) -> Screened | None:
         """The law that promises most, if that is a fair part of what this model lacks beside the cause."""
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
             one
-            for own in Screening(state, self.study, laws, self.secants).candidates.values()
+            for own in Screening(state, laws, self.secants).candidates.values()
             for one in own.values()
             if one.allowed and one.numbers <= numbers and one.gain_nm2 > least
         )
         return max(promising, key=lambda one: one.gain_nm2, default=None)
 
 
-def reshaped_gain(without: State, state: State, study: Study) -> float:
+def reshaped_gain(without: State, state: State) -> float:
     """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
 
     Args:
         without, state: the model without and with the cause.
     """
-    grams = []
-    before, after = (held_out_maps(one.per_fold, study, study.windows) for one in (without, state))
+    grams, study = [], state.study
+    before, after = (one.maps_um(study.windows) for one in (without, state))
     for window, left, own, other in zip(study.windows, state.held_out_um, after, before, strict=True):
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)

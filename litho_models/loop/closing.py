@@ -15,13 +15,13 @@ from torch import nn
 from litho_models.effects import Effect, screened_effects
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
-from litho_models.loop.fits import State, Study, fit_state, held_out_maps
+from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import judge
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.search import Cause, Found, describe, search, untestable
+from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL
 
@@ -31,17 +31,14 @@ class Closed:
     """What was chosen and fitted on some scans.
 
     Attributes:
-        given: the scans as they are; ``study``: freed of what they share by group.
         base_name: of the base with the smallest error; ``others``: those that lost against it.
-        plain: the base fitted to the scans as they are; ``base``: to the freed ones.
+        plain: the base fitted to the scans as they are; ``base``: to scans freed of what a group shares.
         named: among causes; ``lawful``: among short laws beside them.
         described: tables over a covariate, which say where the rest lies; the model has them last.
         rests: what features of layout and place still explain, by stage.
         untestable: effects that could not be tested, with the reason.
     """
 
-    given: Study
-    study: Study
     base_name: str
     others: Mapping[str, nn.Module]
     plain: State
@@ -51,6 +48,16 @@ class Closed:
     described: Found
     rests: dict[str, Rest]
     untestable: dict[str, str]
+
+    @property
+    def given(self) -> Study:
+        """The scans as they are."""
+        return self.plain.study
+
+    @property
+    def study(self) -> Study:
+        """The freed scans."""
+        return self.base.study
 
     @property
     def final(self) -> State:
@@ -83,13 +90,13 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     best = min(fits, key=lambda name: fits[name].mse_nm2)
     plain = fits[best]
     study.report("learning what scans of a group share")
-    freed = replace(study, scans=prepare_scans(freed_scans(plain, study)))
+    freed = replace(study, scans=prepare_scans(freed_scans(plain)))
     start = fit_state(plain.twin, freed)
-    learner = Learner(freed, held_out_maps(start.per_fold, freed, freed.scans))
+    learner = Learner(freed, start.maps_um(freed.scans))
 
     @cache
     def rest(state: State) -> Rest:
-        return learner.rest(held_out_maps(state.per_fold, freed, freed.scans))
+        return learner.rest(state.maps_um(freed.scans))
 
     excluded = untestable(freed)
     candidates = [
@@ -97,7 +104,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         for one in screened_effects(freed.tip_radius_um)
         if one.name not in excluded and one.of_films == freed.of_films
     ]
-    named, lawful, described = _searched(start, freed, candidates, rest)
+    named, lawful, described = _searched(start, candidates, rest)
     stages: dict[State, str] = {}
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
@@ -105,8 +112,6 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         # By the model, so that a stage that changes nothing counts with the one before it.
         stages.setdefault(state, name)
     return Closed(
-        given=study,
-        study=freed,
         base_name=best,
         others={name: base for name, base in bases.items() if name != best},
         plain=plain,
@@ -120,54 +125,54 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
 
 def _searched(
-    start: State, study: Study, candidates: Sequence[Effect], rest: Callable[[State], Rest]
+    start: State, candidates: Sequence[Effect], rest: Callable[[State], Rest]
 ) -> tuple[Found, Found, Found]:
     """Causes, laws beside them, and tables beside both; each cause is checked with everything else in place.
 
     One that fails is taken out, and laws are sought anew without it.
     """
-    named = search(start, study, candidates)
+    study, named = start.study, search(start, candidates)
     # Laws and tables are of heights.
     laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
         # Two terms at most, so that a law is a short formula.
-        lawful = search(named.state, study, laws, 2, secants)
+        lawful = search(named.state, laws, 2, secants)
         study.report("describing what is left")
-        described = describe(lawful.state, study, tables, 2, secants)
+        described = describe(lawful.state, tables, 2, secants)
         if named.causes:
-            in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2, study)
+            in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
             others = [*named.causes, *lawful.causes]
-            check = Check(in_place, others, laws, rest(in_place).mean_nm2, secants, study)
+            check = Check(in_place, others, laws, tables, rest(in_place).mean_nm2, secants)
             named.causes = [check.of(cause) for cause in named.causes]
             if not any(one.reason for one in named.causes):
-                named.causes = [check.beside_laws(one) for one in named.causes]
+                named.causes = [check.beside_table(check.beside_laws(one)) for one in named.causes]
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
-            return named, lawful, _in_model(lawful.state, described, study)
+            return named, lawful, _in_model(lawful.state, described)
         # What may only correct another formula goes first: that formula is then judged without it.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
             named.failed.append(one)
             named.causes.remove(one)
-            named.state = named.state.without(one.name, study) if named.causes else start
+            named.state = named.state.without(one.name) if named.causes else start
 
 
-def _in_model(state: State, described: Sequence[Cause], study: Study) -> Found:
+def _in_model(state: State, described: Sequence[Cause]) -> Found:
     """The model with every table that is confirmed there too, fitted beside all the rest."""
     found = Found(state)
     for table in described:
-        fitted = _with_table(found.state, table, study)
-        judgement = judge(found.state.freed_nm2, fitted.freed_nm2, study)
+        fitted = with_table(found.state, table)
+        judgement = judge(found.state.freed_nm2, fitted.freed_nm2, state.study)
         if judgement.passed(grouped=table.by != ALL):
             found.state = fitted
             found.causes.append(replace(table, judgement=judgement))
     return found
 
 
-def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float, study: Study) -> State:
+def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
     """The model, with the largest table beside it if that takes more than all causes together.
 
     A table follows whatever it can. It is held against all causes, not against single ones.
@@ -175,8 +180,4 @@ def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: floa
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:
         return state
-    return _with_table(state, table, study)
-
-
-def _with_table(state: State, table: Cause, study: Study) -> State:
-    return fit_state(state.twin.with_effect(table.name, table.by, table.values), study, from_here=True)
+    return with_table(state, table)

@@ -12,7 +12,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import State, fit_state, held_out_maps
+from litho_models.loop.fits import State, fit_state
 from litho_models.loop.judging import judge
 from litho_models.loop.measured import Fit, fit_with_measurement
 from litho_models.loop.model import Twin, is_refitted
@@ -96,7 +96,7 @@ class HeldOut:
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
-        maps = held_out_maps(plain.per_fold, self.study, self.study.scans)
+        maps = plain.maps_um(self.study.scans)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
         if not self.study.of_films:
             # A smooth background has five numbers.
@@ -131,7 +131,7 @@ class HeldOut:
         whole_nm = error_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
-            found[name] = error_nm(model.without(name, self.closed.study)) - whole_nm
+            found[name] = error_nm(model.without(name)) - whole_nm
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -155,9 +155,9 @@ class HeldOut:
             study.report(f"trying what was found on {base_name}")
             bare = fit_state(Twin.bare(base), study)
             full = fit_state(final.over(bare.twin.fitted_base), study)
-            for name, by in final.by.items():
-                without = full.without(name, study)
-                if judge(without.freed_nm2, full.freed_nm2, study).passed(grouped=by != ALL):
+            for name, one in final.effects.items():
+                judgement = judge(full.without(name).freed_nm2, full.freed_nm2, study)
+                if judgement.passed(grouped=one.by != ALL):
                     found[name].append(base_name)
         return found
 

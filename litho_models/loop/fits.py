@@ -110,7 +110,7 @@ class Study:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A fitted twin.
+    """A twin fitted to the scans of a study.
 
     Attributes:
         twin: at the numbers fitted to all scans; ``per_fold``: the same, each fitted without its own scans.
@@ -119,6 +119,7 @@ class State:
         freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
     """
 
+    study: Study
     twin: Twin
     per_fold: list[Twin]
     linear: list[Linearised]
@@ -131,11 +132,20 @@ class State:
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
 
-    def without(self, name: str, study: Study) -> State:
+    def __getstate__(self) -> dict[str, object]:
+        """It comes from another process without its scans."""
+        return {**self.__dict__, "study": None}
+
+    def without(self, name: str) -> State:
         """The model without one of its effects, fitted again from here."""
         if name not in self._without:
-            self._without[name] = fit_state(self.twin.without(name), study, from_here=True)
+            self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
         return self._without[name]
+
+    def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
+        """Predicted prints (y, x) of the scans or their windows, each by the twin that has not seen it."""
+        folds = zip(self.study.fold_of, scans, strict=True)
+        return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
 
 class TwinProblem:
@@ -195,20 +205,14 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     per_fold = []
     for fold, (own, _) in enumerate(study.folds):
         per_fold.append(_without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own]))
-    maps = held_out_maps(per_fold, study, windows)
+    maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
     freed = [
         without_terms(left[:, None], window, own)
         for left, window, own in zip(held_out, windows, maps, strict=True)
     ]
-    return State(
-        common, per_fold, linear, held_out, np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
-    )
-
-
-def held_out_maps(per_fold: Sequence[Twin], study: Study, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-    """Predicted prints (y, x), µm, each by the twin that has not seen the scan."""
-    return [per_fold[fold].height(scan) for fold, scan in zip(study.fold_of, scans, strict=True)]
+    freed_nm2 = np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
+    return State(study, common, per_fold, linear, held_out, freed_nm2)
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
@@ -217,7 +221,7 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     The best base without an effect is no good place to look for one beside it: what the base took of the
     effect keeps it there, on the wrong side of a hill.
     """
-    unfitted = twin.with_base_unfitted()
+    unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
         return twin.vector
     # The way to the neighbourhood of the optimum is walked on every third scan.

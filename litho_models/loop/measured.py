@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import fit_least_squares
-from litho_models.loop.fits import RULES, State, Study, TwinProblem, held_out_maps
+from litho_models.loop.fits import RULES, State, TwinProblem
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.scan_terms.measurement import MeasurementModel
@@ -32,12 +32,13 @@ class Fit(NamedTuple):
         return self.measurement.expected_um(scan.stored, self.twin.height(scan))
 
 
-def freed_scans(state: State, study: Study) -> list[PrintedScan]:
+def freed_scans(state: State) -> list[PrintedScan]:
     """The scans without what those of a group share beside their prints.
 
     What all scans share stays in: a cause may have it. A scan is freed by what was learned without its fold.
     """
-    maps = held_out_maps(state.per_fold, study, study.scans)
+    study = state.study
+    maps = state.maps_um(study.scans)
     scans = [scan.stored for scan in study.scans]
     freed = list(scans)
     for own, held_out in study.folds:

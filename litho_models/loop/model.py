@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import vector_to_parameters
 
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Frame
@@ -20,7 +21,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
-Values = dict[str, dict[str, float]]
+Values = Mapping[str, Mapping[str, float]]
 # How near a fitted number is to a bound that it stands on, of its size.
 _AT_BOUND = 1e-6
 
@@ -40,23 +41,38 @@ class Slot:
 
 
 @dataclass(frozen=True)
+class Added:
+    """An effect in a model.
+
+    ``by``: the grouping in which its amplitudes differ, ``all`` for one strength; ``values``: of all its
+    parameters by label, ``""`` for all scans.
+    """
+
+    by: str
+    values: Values
+
+    def of(self, label: str | None) -> dict[str, float]:
+        """The parameters of a group; of one that was never fitted the mean of those that were."""
+        if label is not None and label in self.values:
+            return dict(self.values[label])
+        first = next(iter(self.values.values()))
+        return {key: float(np.mean([own[key] for own in self.values.values()])) for key in first}
+
+
+@dataclass(frozen=True)
 class Twin:
     """Base and effects with their numbers; a fit moves ``vector`` and leaves the rest.
 
     Attributes:
         base: the model of the printer; its own numbers are refitted if they are few.
-        by: effect to the grouping in which its strength differs, ``all`` for one strength.
-        choices: effect to the values of parameters that are never fitted (a direction).
-        slots: the fitted numbers of the effects, in the order of ``vector``, after those of the base.
-        vector: all fitted numbers.
+        numbers: those of the base.
+        effects: in the order in which they came.
         frames: what an effect turns with, where it is not what the catalogue says; see ``EffectChain``.
     """
 
     base: nn.Module
-    by: Mapping[str, str]
-    choices: Mapping[str, Mapping[str, float]]
-    slots: tuple[Slot, ...]
-    vector: np.ndarray
+    numbers: np.ndarray
+    effects: Mapping[str, Added] = field(default_factory=dict)
     frames: Mapping[str, Frame] = field(default_factory=dict)
     _chains: dict[tuple[str, ...], EffectChain] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -65,64 +81,61 @@ class Twin:
     @classmethod
     def bare(cls, base: nn.Module) -> Twin:
         """The base alone."""
-        return cls(base, {}, {}, (), _numbers(base))
+        return cls(base, _numbers(base))
 
     @property
     def own(self) -> int:
         """How many of the numbers are the base's."""
-        return len(self.vector) - len(self.slots)
+        return len(self.numbers)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The effects, as they act."""
-        return tuple(self.by)
+        return tuple(in_forward_order(list(self.effects)))
+
+    @cached_property
+    def slots(self) -> list[Slot]:
+        """The fitted numbers of the effects, in the order of ``vector``, after those of the base."""
+        return [
+            Slot(name, key, label)
+            for name, one in self.effects.items()
+            for key, facts in get_effect(name).parameters.items()
+            if facts.kind != "choice"
+            for label in (sorted(one.values) if facts.kind == "amplitude" and one.by != ALL else [None])
+        ]
+
+    @cached_property
+    def vector(self) -> np.ndarray:
+        """All fitted numbers."""
+        of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
+        return np.concatenate([self.numbers, of_slots])
 
     def at(self, vector: np.ndarray) -> Twin:
         """The same with other numbers."""
-        return replace(self, vector=vector)
+        values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
+        for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
+            for label, own in values[slot.effect].items():
+                if slot.label in (None, label):
+                    own[slot.parameter] = number
+        effects = {name: replace(one, values=values[name]) for name, one in self.effects.items()}
+        return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
         """The same over a base that has not seen the fold, where one was trained without each."""
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
-    def with_effect(self, name: str, by: str, values: Mapping[str, Mapping[str, float]]) -> Twin:
+    def with_effect(self, name: str, by: str, values: Values) -> Twin:
         """One effect more, with starting values by label (``""`` for all scans)."""
-        effect = get_effect(name)
-        first = next(iter(values.values()))
-        fitted = {key: facts for key, facts in effect.parameters.items() if facts.kind != "choice"}
-        slots = [
-            Slot(name, key, label)
-            for key, facts in fitted.items()
-            for label in (sorted(values) if facts.kind == "amplitude" and by != ALL else [None])
-        ]
-        numbers = [values.get(slot.label or "", first)[slot.parameter] for slot in slots]
-        groupings = {**self.by, name: by}
-        return replace(
-            self,
-            by={one: groupings[one] for one in in_forward_order(list(groupings))},
-            choices={
-                **self.choices,
-                name: {key: first[key] for key in effect.parameters if key not in fitted},
-            },
-            slots=(*self.slots, *slots),
-            vector=np.concatenate([self.vector, numbers]),
-        )
+        return replace(self, effects={**self.effects, name: Added(by, values)})
 
     def only(self, names: Collection[str]) -> Twin:
         """The same with no other effects than these."""
-        kept = [i for i, slot in enumerate(self.slots) if slot.effect in names]
-        return replace(
-            self,
-            by={one: by for one, by in self.by.items() if one in names},
-            choices={one: own for one, own in self.choices.items() if one in names},
-            slots=tuple(self.slots[i] for i in kept),
-            vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
-        )
+        return replace(self, effects={name: one for name, one in self.effects.items() if name in names})
 
     def without(self, name: str) -> Twin:
         """The same without one of its effects."""
-        return self.only({*self.by} - {name})
+        return self.only({*self.effects} - {name})
 
     def alone(self) -> Twin:
         """The same without any effect."""
@@ -130,70 +143,53 @@ class Twin:
 
     def ungrouped(self) -> Twin:
         """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
-        twin = self.alone()
-        for name, values in self.values({}).items():
-            twin = twin.with_effect(name, ALL, {"": values})
-        return twin
+        effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
+        return replace(self, effects=effects)
 
     def over(self, base: nn.Module) -> Twin:
         """The same effects over another base."""
-        return replace(self, base=base, vector=np.concatenate([_numbers(base), self.vector[self.own :]]))
+        return replace(self, base=base, numbers=_numbers(base))
 
-    def with_base_unfitted(self) -> np.ndarray:
-        """The numbers with the base's as they are before any fit."""
+    def with_base_unfitted(self) -> Twin:
+        """The same with the base as it is before any fit."""
         if not (self.own and isinstance(self.base, Simulator)):
-            return self.vector
-        return np.concatenate([_numbers(type(self.base)(self.base.config)), self.vector[self.own :]])
+            return self
+        return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
-    def values(self, label_in: Mapping[str, str]) -> Values:
-        """Parameter values of all effects for the scans with these labels, by grouping.
-
-        An amplitude of a label that was never fitted is the mean of those that were.
-        """
-        found: Values = {name: dict(self.choices[name]) for name in self.by}
-        alike: dict[tuple[str, str], dict[str | None, float]] = {}
-        for slot, number in zip(self.slots, self.vector[self.own :], strict=True):
-            alike.setdefault((slot.effect, slot.parameter), {})[slot.label] = float(number)
-        for (name, parameter), known in alike.items():
-            mean = float(np.mean(list(known.values())))
-            found[name][parameter] = known.get(label_in.get(self.by[name], ""), mean)
-        return found
+    def values(self, label_in: Mapping[str, str]) -> dict[str, dict[str, float]]:
+        """Parameter values of all effects, as they act, for the scans with these labels, by grouping."""
+        return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
         """The scan's label in every grouping in use."""
-        return {by: label_of(scan.stored, by) for by in dict.fromkeys(self.by.values()) if by != ALL}
+        return {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
         """Whether a number is one of the scan's own group, or of all scans."""
-        return slot.label is None or slot.label == label_of(scan.stored, self.by[slot.effect])
+        return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
         """The same with nothing but these scans behind it.
 
         A strength of a group that none of them is in becomes the mean of the other groups' strengths.
         """
-        seen = [any(self.is_of(slot, scan) for scan in scans) for slot in self.slots]
-        vector = self.vector.copy()
-        for at, slot in enumerate(self.slots):
-            if not seen[at]:
-                alike = [
-                    self.vector[self.own + other]
-                    for other, one in enumerate(self.slots)
-                    if seen[other] and (one.effect, one.parameter) == (slot.effect, slot.parameter)
-                ]
-                vector[self.own + at] = np.mean(alike) if alike else slot.facts.null
-        return self.at(vector)
+        effects = {}
+        for name, one in self.effects.items():
+            seen = {label_of(scan.stored, one.by) for scan in scans}
+            known = {label: own for label, own in one.values.items() if label in seen}
+            known = known or {"": get_effect(name).off_values()}
+            effects[name] = replace(
+                one, values={label: Added(one.by, known).of(label) for label in one.values}
+            )
+        return replace(self, effects=effects)
 
     @cached_property
     def fitted_base(self) -> nn.Module:
         """The base at its numbers: a copy of its own, where it has any."""
         if not self.own:
             return self.base
-        base, at = copy.deepcopy(self.base), 0
-        for parameter in _parameters(base):
-            values = self.vector[at : at + parameter.numel()]
-            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
-            at += parameter.numel()
+        base = copy.deepcopy(self.base)
+        vector_to_parameters(torch.as_tensor(self.numbers, dtype=torch.float32), _parameters(base))
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:

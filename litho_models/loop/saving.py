@@ -11,7 +11,6 @@ from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.closing import Closed
 from litho_models.loop.folded_base import FoldedBase
-from litho_models.loop.model import Values
 from litho_models.loop.record import CloseLoop
 from litho_models.simulator import Simulator
 
@@ -37,17 +36,19 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
     values = twin.values(twin.labels(latest))
     sides = {"process": "printer", "measurement": "microscope"}
-    by_side: dict[str, Values] = {f"{side}_effects": {} for side in (*sides, "undetermined")}
-    for one in result.effects:
-        side = one.role if one.role in sides else "undetermined"
-        by_side[f"{side}_effects"][one.name] = values[one.name]
+
+    def on(*roles: str) -> dict[str, dict[str, float]]:
+        return {one.name: values[one.name] for one in result.effects if one.role in roles}
+
     error = result.error("all")
     assert error is not None
     save_frozen(
         base,
         folder,
         name=f"{result.base_model}, loop findings",
-        **by_side,
+        process_effects=on("process"),
+        measurement_effects=on("measurement"),
+        undetermined_effects=on("nuisance", "undetermined"),
         dataset=result.dataset.model_dump(mode="json"),
         attributed={
             one.name: sides[one.role]

@@ -15,7 +15,7 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect
 from litho_models.fitting.least_squares import gram_inside
-from litho_models.loop.fits import State, Study
+from litho_models.loop.fits import State
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.trials import Secants, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
@@ -73,7 +73,7 @@ class Screening:
     """Secants of all trials, and their inner products with what a fitted state leaves.
 
     Args:
-        state: the model so far; ``study``: its scans; ``effects``: candidates, none of them in the model.
+        state: the model so far; ``effects``: candidates, none of them in the model.
         secants: at another model, near enough to tell what is worth fitting; by default at the state.
         kept: numbers of the model that residual and columns are not freed of.
     """
@@ -81,15 +81,14 @@ class Screening:
     def __init__(
         self,
         state: State,
-        study: Study,
         effects: Sequence[Effect],
         secants: Secants | None = None,
         kept: Collection[int] = (),
     ):
-        self.study, self._mse_nm2 = study, state.mse_nm2
+        self.study, self._mse_nm2 = state.study, state.mse_nm2
         own = len(state.twin.vector)
         self.trials = trials_of(effects, 1 + own)
-        secants = secants or Secants(state.twin, study.windows)
+        secants = secants or Secants(state.twin, self.study.windows)
         parts = zip(state.held_out_um, state.linear, secants.of(self.trials), secants.free_terms, strict=True)
         grams, raw = [], np.array(1e-300)
         for left, part, rows, free in parts:
@@ -97,7 +96,7 @@ class Screening:
             whole = stacked.T @ stacked / len(stacked)
             grams.append(whole - gram_inside(stacked, free) / len(stacked))
             raw = raw + np.diag(whole)
-        products = Products(np.stack(grams), study.groups)
+        products = Products(np.stack(grams), self.study.groups)
         self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if i not in kept]).grams
         self._beside_base, self._retained = (
             np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)

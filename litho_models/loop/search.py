@@ -73,7 +73,6 @@ class Found:
 
 def search(
     start: State,
-    study: Study,
     candidates: Sequence[Effect],
     most: int = 8,
     secants: Secants | None = None,
@@ -81,69 +80,76 @@ def search(
     """Add effects to a fitted model, at most so many.
 
     Args:
-        start: the model so far; ``study``: scans, folds and groups; ``candidates``: what may be added.
+        start: the model so far; ``candidates``: what may be added.
         secants: of the candidates at a model like this one; by default at the model itself.
     """
     found = Found(start)
-    while len(found.causes) < most and _add_one(found, study, candidates, secants):
+    while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
-    _defend(found, study)
+    _defend(found)
     return found
 
 
 def describe(
-    state: State, study: Study, tables: Sequence[Effect], most: int, secants: Secants | None = None
+    state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
     """Tables that stand out beside a model, each as a linear fit beside it alone."""
     found: list[Cause] = []
-    for one in Screening(state, study, tables, secants).standing()[:most]:
-        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, study)
+    for one in Screening(state, tables, secants).standing()[:most]:
+        judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
         if judgement.passed(grouped=one.by != ALL):
             found.append(Cause(one.name, one.by, (), judgement, one.family_p, one.group_p, one.start()))
     return found
 
 
-def _add_one(found: Found, study: Study, candidates: Sequence[Effect], secants: Secants | None) -> bool:
+def with_table(state: State, table: Cause) -> State:
+    """A model with such a table beside all the rest, fitted from there."""
+    twin = state.twin.with_effect(table.name, table.by, table.values)
+    return fit_state(twin, state.study, from_here=True)
+
+
+def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None) -> bool:
+    study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]
     if not effects:
         return False
-    screening = Screening(found.state, study, effects, secants)
+    screening = Screening(found.state, effects, secants)
     found.first, found.last = screening.common | found.first, found.last | screening.common
     left = screening.standing()
     study.report(f"{len(left)} of {len(effects)} candidates stand out")
     while left:
         entering = [left[0], *_rivals(left[0], left[1:], screening)]
         left = [one for one in left if one not in entering]
-        fitted = _fitted(found.state, entering, study)
+        fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
             judgement = judge(found.state.freed_nm2, fitted[one.name].freed_nm2, study)
             if refused := judgement.reason(grouped=one.by != ALL):
                 found.refused[one.name] = refused
                 continue
-            alike = _alike(one, fitted, found.state, screening, study)
+            alike = _alike(one, fitted, found.state, screening)
             found.causes.append(Cause(one.name, one.by, alike, judgement, one.family_p, one.group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
             if one.by == ALL:
-                _regroup(found, study)
+                _regroup(found)
             gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
 
 
-def _regroup(found: Found, study: Study) -> None:
+def _regroup(found: Found) -> None:
     """Let the strength of the cause that was just added differ by group, if that is confirmed.
 
     The derivative where the effect stands says more than the one at its null, by which it was screened.
     """
-    cause, twin = found.causes[-1], found.state.twin
+    cause, twin, study = found.causes[-1], found.state.twin, found.state.study
     slots = {
         at: slot
         for at, slot in enumerate(twin.slots, twin.own)
         if slot.effect == cause.name and slot.facts.kind == "amplitude"
     }
-    screening = Screening(found.state, study, (), kept=slots)
+    screening = Screening(found.state, (), kept=slots)
 
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return screening.gains_by(labels, [1 + at for at in slots])
@@ -176,7 +182,7 @@ def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) 
 
 
 def _alike(
-    one: Screened, fitted: Mapping[str, State], before: State, screening: Screening, study: Study
+    one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
     """What these scans cannot tell from it: by fits where there are, by what is screened elsewhere."""
     own = fitted[one.name]
@@ -185,7 +191,7 @@ def _alike(
         for name, other in sorted(fitted.items(), key=lambda pair: pair[1].mse_nm2)
         if name != one.name
         and same_change(before, own, other)
-        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, study)
+        and not told_apart(before.freed_nm2, own.freed_nm2, other.freed_nm2, before.study)
     ]
     others = (by[one.by] for name, by in screening.candidates.items() if name not in fitted)
     by_screening = [
@@ -198,9 +204,11 @@ def _alike(
     return (*by_fit, *by_screening)
 
 
-def _fitted(state: State, entering: Sequence[Screened], study: Study) -> dict[str, State]:
+def _fitted(state: State, entering: Sequence[Screened]) -> dict[str, State]:
+    study = state.study
     jobs = [(one.name, state.twin.with_effect(one.name, one.by, one.start()), study) for one in entering]
-    return {name: own for (name, *_), own in run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])}
+    done = run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])
+    return {name: replace(own, study=study) for (name, *_), own in done}
 
 
 def _fit(job: tuple[str, Twin, Study]) -> State:
@@ -219,13 +227,14 @@ def same_change(before: State, one: State, other: State) -> bool:
     return bool(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300) >= SAME_COSINE)
 
 
-def _defend(found: Found, study: Study) -> None:
+def _defend(found: Found) -> None:
     """Each cause is taken out, the rest fitted again: what is not confirmed with all others in place goes."""
     if len(found.causes) < 2:
         return
+    study = found.state.study
     for cause in list(found.causes):
         study.report(f"deciding once more on {cause.name}")
-        without = found.state.without(cause.name, study)
+        without = found.state.without(cause.name)
         judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
         at = found.causes.index(cause)
         if judgement.passed(grouped=cause.by != ALL):

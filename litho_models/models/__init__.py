@@ -36,12 +36,12 @@ MODELS: dict[str, type[Simulator]] = {
 
 
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
-    """Take a model by its name from now on, in every function and command of this process.
+    """Make a model known by its name in every function and command of this process.
 
-    In a plug-in, of every process of a command.
+    Called in a plug-in, it makes the model known in every process of a command.
 
     Raises:
-        InputError: no name of its own, or one that is taken.
+        InputError: a model without a name of its own, or with one that is taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
@@ -77,7 +77,7 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """The numbers of a model that no fit changes: the usual ones, some more, and some less.
+    """The numbers of a model that no fit changes: the usual ones and ``fix``, but not ``free``.
 
     Raises:
         InputError: an unknown model, or a number to free that is not fixed.

@@ -1,4 +1,4 @@
-"""The authors' weights in our models: their classes are variant ``authors``, their names are read here.
+"""The authors' weights in our models: their classes are variant ``authors``, their names are translated.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -35,7 +35,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         fields: config fields of the model (geometry).
 
     Raises:
-        InputError: weights of no class of theirs, or some that are missing, unknown or of another shape.
+        InputError: weights of none of their classes, or some that are missing, unknown or of another shape.
     """
     if not isinstance(weights, Mapping):
         hint = "torch.load reads their file"
@@ -65,7 +65,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
             got=f"missing, unknown or of another size: {', '.join(wrong)}",
             wanted="their state_dict as a whole",
         )
-    # Theirs are convolutions of 1 x 1 and numbers of shape (1,) where ours are matrices and numbers.
+    # Their 1 x 1 convolutions and numbers of shape (1,) are matrices and plain numbers here.
     model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})
     return model.eval()
 
@@ -76,7 +76,7 @@ def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Ten
         alpha = float(state["raw_alpha"])
         if not alpha > 0:
             raise InputError("alpha of the authors' physics", got=alpha, wanted="above 0")
-        # Theirs is the steepness itself, ours the raw number behind it.
+        # Their parameter is the steepness itself, ours the raw number behind it.
         state["raw_alpha"] = steepness.raw(alpha)
     return state
 
@@ -100,7 +100,7 @@ def _fno_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         names |= {f"w{i}.{kind}": f"local.{i}.{kind}" for i in range(4)}
     state = {names.get(name, name): value for name, value in own.items()}
     for i in range(4):
-        # Ours holds the matrices of both signs of the frequency along y.
+        # Our parameter holds the matrices of both signs of the frequency along y.
         signs = [state.pop(f"conv{i}.weights{sign}", None) for sign in (1, 2)]
         pair = [matrix for matrix in signs if matrix is not None]
         if len(pair) == 2 and pair[0].shape == pair[1].shape:

@@ -1,7 +1,7 @@
-"""Networks of fixed features of a field: what surrounds a pixel of a layout, and what a height does along x.
+"""Networks of fixed features of a field: the surroundings of a layout's pixel, or how a height runs along x.
 
 The features have no parameters, so that such a network is fitted to single pixels
-(``litho_models.fitting.pixels``): seconds, where a network of crops takes minutes.
+(``litho_models.fitting.pixels``), in seconds; a network trained on crops takes minutes.
 """
 
 from abc import abstractmethod
@@ -17,8 +17,8 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# Change over σ, relative to the highest level, below which the length of a slope is rounded off, so that it
-# has a derivative: 2 nm.
+# Change over σ, relative to the highest level, below which the length of a slope is smoothed, so that it has
+# a derivative at 0: 2 nm.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
@@ -32,7 +32,7 @@ class FeatureNetworkConfig(BaseModel):
 
     hidden: tuple[int, ...] = Field((48, 32), min_length=1, max_length=8, description="hidden units")
     blurs_um: Widths = Field((0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5), description="σ")
-    slope_blurs_um: Widths = Field((0.15, 0.3, 0.6), min_length=1, description="σ of what has a slope")
+    slope_blurs_um: Widths = Field((0.15, 0.3, 0.6), min_length=1, description="σ of the blurs with slopes")
     shifts_um: Widths = Field((0.2, 0.5, 1.0), min_length=1, description="displacements")
     steep_um: Widths = Field((0.4, 1.0, 2.0), description="σ of the mean steepness around a pixel")
 
@@ -45,9 +45,9 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 
 class FeatureNetwork(OfField, nn.Module):
-    """A function of the features of each pixel, µm: linear, and beside it a network; zero at the start."""
+    """A function of the features of each pixel, µm: a linear part plus a network; zero at the start."""
 
-    # Whether the network may add a height of its own, the same everywhere.
+    # Whether the network may add a constant height.
     has_constant: ClassVar[bool] = True
     centre: Tensor
     scale: Tensor
@@ -93,7 +93,7 @@ class FeatureNetwork(OfField, nn.Module):
         """The same from features (features, n): (n,) µm."""
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # What standardises the features is in the weights: one pass over the pixels less, and its gradient.
+        # The weights include the standardisation, which saves one pass over the pixels and its gradient.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
@@ -103,7 +103,7 @@ class FeatureNetwork(OfField, nn.Module):
         return (total + hidden)[0]
 
     def standardise(self, centre: Tensor, scale: Tensor) -> None:
-        """State mean and standard deviation (features,) of what the network sees."""
+        """Set the mean and standard deviation (features,) of the network's inputs."""
         self.centre.copy_(centre)
         self.scale.copy_(scale)
 
@@ -113,7 +113,7 @@ class FeatureNetwork(OfField, nn.Module):
 
 
 class Surroundings(FeatureNetwork):
-    """Of the layout around a pixel, x and y alike: blurs, slopes, displaced copies, mean steepness."""
+    """Features of the layout near a pixel, x and y alike: blurs, slopes, displaced copies, mean steepness."""
 
     def features(self, field_um: Tensor) -> list[Tensor]:
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
@@ -144,9 +144,9 @@ class Surroundings(FeatureNetwork):
 
 
 class ScanAxis(FeatureNetwork):
-    """Of a printed height along x, as a microscope's lines go over it: slopes, steps, mean steepness.
+    """Features of a printed height along x, the microscope's lines: slopes, steps, mean steepness.
 
-    All of them are 0 where the print does not change along x, and so is what the network adds there.
+    All are 0 where the print does not change along x, and the network adds nothing there.
     """
 
     has_constant = False
@@ -180,7 +180,7 @@ class ScanAxis(FeatureNetwork):
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
-    """The layer over values (inputs, n), pixels last: (outputs, n)."""
+    """Apply the layer to values (inputs, n), pixels last: (outputs, n)."""
     if layer.bias is None:
         return layer.weight @ values
     return torch.addmm(layer.bias[:, None], layer.weight, values)

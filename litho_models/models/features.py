@@ -1,4 +1,4 @@
-"""Linear in many features of the layout: how far blurs, slopes and their products go without a network."""
+"""Models linear in many features of the layout: how far blurs, slopes and products go without a network."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# Relative height per µm below which the length of a slope is rounded off, so that it has a derivative.
+# Relative height per µm below which the length of a slope is smoothed, so that it has a derivative at 0.
 _LEAST_SLOPE = 1e-4
 _UNITS_AT_ONCE = 64
 
@@ -34,8 +34,8 @@ class FeaturesConfig(SimulatorConfig):
     shifts_um: tuple[float, ...] = Field((0.2, 0.5, 1.0), min_length=1, description="displacements, µm")
     shift_sigma_um: float = Field(0.1, gt=0, description="blur of what is displaced, µm")
     streak_sigmas_um: tuple[float, ...] = Field((), description="blurs along one axis only, µm")
-    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs whose slopes are averaged, µm")
-    steep_widths_um: tuple[float, ...] = Field((), description="over how much around a pixel, µm")
+    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs with averaged slopes, µm")
+    steep_widths_um: tuple[float, ...] = Field((), description="widths of these averages, µm")
 
 
 class OfField(ABC):
@@ -50,7 +50,7 @@ class OfField(ABC):
         """How far features reach."""
 
     def _point(self) -> Tensor:
-        """The smallest field that has features, of one pixel."""
+        """The smallest field that has features, namely those of one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -70,10 +70,10 @@ class OfField(ABC):
 class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
-    φ: blurs with their cubes and the products of each two; slopes along y and x at several blurs, their
+    φ: blurs with their cubes and the products of each pair; slopes along y and x at several blurs, their
     sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps up to
-    them; blurs along one axis; how steep the surroundings are along each. Sizes |∂x| and |∂y| are features of
-    their own because a microscope's lines make the two axes unlike.
+    them; blurs along one axis; how steep the surroundings are along each axis. Sizes |∂x| and |∂y| are
+    separate features because a microscope's lines make the two axes differ.
     The weights are found in closed form, see ``litho_models.fitting.ridge``.
     """
 
@@ -130,7 +130,7 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Copies displaced to each side, and the sizes of the steps up to them and across."""
+        """Copies displaced to each side, and the sizes of the steps to them and between opposite ones."""
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
         here = crop_border(sharp, steps[-1])
@@ -142,13 +142,13 @@ class Features(OfField, Simulator):
         return found
 
     def _streaks(self, layout: Tensor) -> list[Tensor]:
-        """Blurs that are wide along y, and along x, and a pixel along the other axis."""
+        """Blurs that are wide along one axis (y, then x) and one pixel wide along the other."""
         wide, narrow = self.config.streak_sigmas_um, self.pitch_um
         pairs = [pair for sigma in wide for pair in ((sigma, narrow), (narrow, sigma))]
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
 
     def _steepness(self, layout: Tensor) -> list[Tensor]:
-        """Means around each pixel of the sizes and squares of slopes along y and x; of slopes in σ per σ."""
+        """Means around each pixel of |slope| and slope² along y and x; a slope is a height change over σ."""
         widths, found = self.config.steep_widths_um, []
         margin = self._radius(*widths)
         for sigma in self.config.steep_sigmas_um:
@@ -167,11 +167,11 @@ class RandomFeaturesConfig(FeaturesConfig):
     steep_widths_um: tuple[float, ...] = (1.0, 2.5)
     units: int = Field(500, ge=1, description="random features")
     inputs: int = Field(8, ge=1, description="simple features that each of them sees")
-    seed: int = Field(0, ge=0, description="of what they see")
+    seed: int = Field(0, ge=0, description="seed of their draw")
 
 
 class RandomFeatures(Features):
-    """``Features`` and tanh(V z + c) of the standardised simple ones, V and c drawn at random and kept.
+    """``Features`` plus tanh(V z + c), z the standardised simple features, V and c random and fixed.
 
     A network with one hidden layer that is not trained (random features, Rahimi and Recht 2008): what lies
     beyond products of two features can be learned, still in closed form.
@@ -204,18 +204,18 @@ class RandomFeatures(Features):
         standard = self._standard(torch.cat(simple, dim=1))
         for block in torch.arange(self.config.units).split(_UNITS_AT_ONCE):
             own = self.weights[known:][block], self.directions[block], self.thresholds[block]
-            # Computed again for a gradient: all units of a field at once would take gigabytes.
+            # Computed again in the backward pass: all units of a field at once would take gigabytes.
             height = height + checkpoint(_random_part, standard, *own, use_reentrant=False)
         return height
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """As of ``Features``, then the random ones."""
+        """The features of ``Features``, then the random ones."""
         known = super().at_pixels(layout_um, at)
         standard = self._standard(known[None, : len(self.centre), :, None])[0, ..., 0]
         return torch.cat([known, torch.tanh(self.directions @ standard + self.thresholds[:, None])])
 
     def standardise(self, centre: Tensor, scale: Tensor) -> None:
-        """State mean and standard deviation (simple features,) of what the random ones see."""
+        """Set the mean and standard deviation (simple features,) of the random features' inputs."""
         self.centre.copy_(centre)
         self.scale.copy_(scale)
 

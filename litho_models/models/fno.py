@@ -18,7 +18,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Ninety times the paper's, 0.5 GB of weights: more no card may ask of the machine that loads it.
+# Ninety times the paper's number, 0.5 GB of weights: a card may not ask more of the machine that loads it.
 _MOST_MATRIX_ENTRIES = 30_000_000
 _ALL = slice(None)
 
@@ -64,7 +64,7 @@ class Fno(Simulator):
     """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), no gelu after the last.
 
     P lifts each pixel to ``width`` channels, Q maps them to a height through one hidden layer. With
-    ``starts_as_layout`` this is what is added to M, zero at the start. Where the config has a tile,
+    ``starts_as_layout`` this is added to M, and is zero at the start. Where the config has a tile,
     ``interior`` is the height of one tile, taken as periodic, and the field is blended from tiles.
     """
 
@@ -153,7 +153,7 @@ class PeriodicConvolution(nn.Conv2d):
 class _Continued(torch.autograd.Function):
     """A periodic image (b, y, x, channels) continued by a margin on all sides.
 
-    PyTorch's own way back, slice by slice, makes a field of zeros for each of the four.
+    PyTorch's own backward pass makes a field of zeros for each of the four slices.
     """
 
     @staticmethod
@@ -191,7 +191,7 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor, onto: Tensor, rows: slice = _ALL) -> Tensor:
-        """Of a field (b, y, x, channels), added to ``onto``, which has its shape or that of some rows of it.
+        """Convolve a field (b, y, x, channels) and add it to ``onto``, of the same shape or some rows of it.
 
         An image smaller than the modes keeps those it has.
 
@@ -210,7 +210,7 @@ class SpectralConvolution(nn.Module):
             along_y = waves_y @ field.reshape(-1, ny, nx * channels)
             along_x = waves_x @ along_y.reshape(-1, 2, kept_y + 1, nx, channels)
             cosine, sine = along_x.split(kept_x, dim=-2)
-            # The field is real: along y, that of -k_y is the conjugate of that of k_y.
+            # The field is real: along y, the sum for -k_y is the conjugate of the one for k_y.
             above = torch.complex(cosine[:, 0] + sine[:, 1], cosine[:, 1] - sine[:, 0])
             below = torch.complex(cosine[:, 0] - sine[:, 1], -cosine[:, 1] - sine[:, 0])
             spectra = torch.stack([above, below])
@@ -230,9 +230,9 @@ class SpectralConvolution(nn.Module):
             return torch.baddbmm(onto, back_y, lines).reshape(*back_y.shape[:2], nx, channels)
 
     def _matrices(self, kept_y: int, kept_x: int) -> Tensor:
-        """Of k_y and of -k_y for k_y from 0 to ``kept_y``, complex (2, in, out, k_y, k_x).
+        """Matrices for k_y and -k_y, k_y from 0 to ``kept_y``, complex (2, in, out, k_y, k_x).
 
-        The zeros: of 0 and -0 only one is kept, and of the highest only the negative.
+        Two are zero: that for -0, because 0 is kept once, and that for +``kept_y``, which is not kept.
         """
         positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
         above = functional.pad(positive[:, :, :kept_y], (0, 0, 0, 1))

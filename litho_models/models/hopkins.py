@@ -19,9 +19,9 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 
-# Of λ / NA: beyond it a kernel is cut off.
+# Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
-# Points along each side of a frequency's cell, by which its share of the source is counted; odd, for a point.
+# Points per side of a frequency's cell, to count its share of the source; odd, so that one is the centre.
 _COUNTED = 9
 
 
@@ -29,10 +29,10 @@ class Optics(NamedTuple):
     """A projection lens and its light.
 
     Attributes:
-        wavelength_um, na: of the light, and on the side of the image.
+        wavelength_um, na: wavelength, and numerical aperture on the image side.
         outer, inner: radii of a round or ring-shaped source, relative to the pupil; 0: a point.
         defocus_um: distance of the resist from the focus.
-        kernels: how many there are, the strongest first.
+        kernels: number of kernels, the strongest first.
     """
 
     wavelength_um: float
@@ -44,7 +44,7 @@ class Optics(NamedTuple):
 
 
 def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
-    """Pixels to each side that a kernel holds."""
+    """Pixels that a kernel reaches to each side."""
     return max(1, math.ceil(_REACH * optics.wavelength_um / optics.na / pitch_um))
 
 
@@ -53,7 +53,7 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     reach = kernel_reach_px(optics, pitch_um)
     ny, nx = transmission.shape[-2:]
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
-    # A transform spreads its roundings over the field: in double precision a tile prints what the whole does.
+    # Transforms spread rounding over the field; in double precision a tile prints what the whole field does.
     image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
     return image.to(transmission.dtype)
 
@@ -70,10 +70,10 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
 def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
     """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
 
-    Source points lie on the grid of the field's frequencies, each as bright as its cell is filled.
+    Source points lie on the grid of the field's frequencies, each weighted by the filled share of its cell.
 
     Raises:
-        InputError: a ring too thin to fill any.
+        InputError: a ring too thin to fill any cell.
     """
     fy, fx = (np.fft.fftfreq(n, pitch_um) for n in shape)
     y, x = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
@@ -84,7 +84,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
         raise InputError(
             "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
         )
-    # What no source point brings into the pupil is dark in all kernels.
+    # Frequencies that no source point brings into the pupil are 0 in all kernels.
     reach = 1 + np.hypot(y[source], x[source]).max() / cutoff
     bright = np.flatnonzero(np.hypot(y, x) / cutoff <= reach + 1e-9)
     shifted = y[source, None] + y[bright], x[source, None] + x[bright]
@@ -124,7 +124,7 @@ def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) ->
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
     placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
-    # A mask that is open everywhere is 1, with as many kernels as there are.
+    # A mask that is open everywhere has the intensity 1, whatever the number of kernels.
     spectra = np.fft.fft2(placed)
     spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
     return torch.from_numpy(spectra)

@@ -1,6 +1,6 @@
 """The parts of a printer: each a function from one field to the next, with its numbers and its source.
 
-Fields are (batch, 1, y, x), relative to a full dose or height. A part may cut them by its reach.
+Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop them by its reach.
 """
 
 import math
@@ -20,7 +20,7 @@ from litho_models.simulator import crop_border
 
 # Change of the resist from pixel to pixel below which there is no edge.
 FLATTEST = 5e-3
-# Where a length starts, times this, ends its range.
+# The range of a length ends at this multiple of its start.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
@@ -36,7 +36,7 @@ class Number:
     Attributes:
         start: where a fit begins; ``unit``: ``1`` for none.
         lower, upper: its range; by default a length ends at five times its start.
-        fitted: or else it is what one says.
+        fitted: whether a fit changes it; otherwise it keeps its value.
     """
 
     start: float
@@ -46,7 +46,7 @@ class Number:
     fitted: bool = True
 
     def range_at(self, name: str, start: float) -> Range:
-        """The range of a fit that begins there."""
+        """The range of a fit that begins at ``start``."""
         upper = self.upper if self.upper is not None else _WIDEST * start if self.unit == "µm" else math.inf
         return Range(name, self.lower, upper)
 
@@ -58,7 +58,7 @@ class Part:
     Attributes:
         name, stage: what it is called, and where it acts.
         numbers: by name, see ``Number``; ``source``: where the formula comes from.
-        apply: field, values, pitch (µm) to the next field, cut by ``reach_px`` of values and pitch.
+        apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
     name: str
@@ -71,21 +71,21 @@ class Part:
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
     """Pixels that a Gaussian spot reaches."""
-    # In float32 a width is never quite itself: its last digits must not move the edge of the kernel.
+    # Float32 rounds a width; its last digits must not move the edge of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
 
 def illuminate(
     pattern: Tensor, spots: Sequence[tuple[Tensor | float, Tensor]], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Illumination: exposure by a spot of several Gaussians, Σ share · G_sigma; cut by ``reach_px``.
+    """Illumination: exposure by a spot of several Gaussians, Σ share · G_sigma; cropped by ``reach_px``.
 
-    One for light or a fine beam; a second, wide one for electrons that come back (Chang, J. Vac. Sci.
+    One Gaussian for light or a fine beam; a second, wide one for backscattered electrons (Chang, J. Vac. Sci.
     Technol. 12, 1271 (1975)); a third between them.
 
     Args:
-        pattern: what is written; ``spots``: share and standard deviation (µm) of each; ``pitch_um``: of it.
-        reach_px: the widest reach of them or more.
+        pattern: what is written, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each.
+        reach_px: at least the widest reach of the spots.
     """
     total = torch.zeros(())
     for share, sigma_um in spots:
@@ -105,7 +105,7 @@ def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
 
 
 def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
-    """Resist: share that a dose turns, E^γ / (E^γ + η^γ), of contrast γ; a half at the threshold η."""
+    """Resist: share that a dose converts, E^γ / (E^γ + η^γ), contrast γ; one half at the threshold η."""
     turned = exposure.clamp(min=1e-6) ** contrast
     return turned / (turned + threshold**contrast)
 
@@ -117,7 +117,7 @@ def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tens
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Transfer: coverage of a film etched where resist stands above the threshold; cut by one pixel.
+    """Transfer: coverage of a film that stays where resist exceeds the threshold; cropped by one pixel.
 
     The edge lies where the resist crosses the threshold, moved outward by the bias; a pixel that it crosses
     is covered in part: a sigmoid, one pixel wide, of the distance (resist - threshold) / |∇ resist| + bias.
@@ -198,7 +198,7 @@ PARTS = {
             "resist",
             _CONTRAST,
             lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
-            "share that a dose turns, with a half at the threshold",
+            "share that a dose converts, one half at the threshold",
         ),
         Part(
             "contrast-curve",
@@ -212,7 +212,7 @@ PARTS = {
             "resist",
             {},
             lambda resist, values, pitch: 1 - resist,
-            "a positive resist stands where a negative one does not, an imprint where its master does not",
+            "a positive resist remains where a negative one goes, an imprint is the inverse of its master",
         ),
         Part(
             "diffusion",
@@ -227,7 +227,7 @@ PARTS = {
             "transfer",
             {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
             lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
-            "a film that stays where resist stands, its edge moved by a bias",
+            "a film that stays under the resist, its edge moved by a bias",
             lambda values, pitch: 1,
         ),
         Part(
@@ -242,7 +242,7 @@ PARTS = {
 
 
 def register_part(part: Part) -> Part:
-    """Take a part by its name from now on, in ``parts`` of the printers of this process.
+    """Make a part known by its name, for ``parts`` of the printers of this process.
 
     Raises:
         InputError: a name that is taken.

@@ -1,4 +1,4 @@
-"""PBL: physics-based learning, the paper's simulator with networks at its unknown places.
+"""PBL: physics-based learning, the paper's simulator with networks for its unknown steps.
 
 arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL
 model": optical blur of fixed width, pointwise network (exposure threshold), diffusion blur of
@@ -40,7 +40,7 @@ class PblConfig(SimulatorConfig):
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
-    # Wider than the areawise network sees (0.5 µm): what it starts with is what it alone can learn.
+    # Wider than the areawise network sees (0.5 µm): it starts with what no other part can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
@@ -54,7 +54,7 @@ class PblConfig(SimulatorConfig):
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
     # Not in the paper, nor in frozen models of older versions, whose cards do not know these three.
-    transposable: bool = Field(False, description="areawise network that does not know x from y")
+    transposable: bool = Field(False, description="areawise network that treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
     scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
 
@@ -79,7 +79,7 @@ class PblConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As of every model; the networks of features have lengths of their own."""
+        """As for every model; the lengths of the feature networks are scaled as well."""
         config = super().of_variant(variant, **fields)
         parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
         scaled = {
@@ -102,9 +102,9 @@ class Pbl(Simulator):
     With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I),
     g_shrink = 1 + net, g_mismatch(H) = H + net(H), last layers zero at the start.
 
-    To this chain the default adds two networks of fixed features. ``surroundings`` is what the layout within
-    some micrometres does, x and y alike. ``scan_axis`` is what the height along x does to the measured map:
-    fitted with the rest, so that the rest need not learn it, and left out of ``printer()``.
+    To this chain the default adds two networks of fixed features. ``surroundings`` is the influence of the
+    layout within some micrometres, x and y alike. ``scan_axis`` is the influence of the height along x on the
+    measured map: fitted with the rest, so that the rest need not learn it, and left out of ``printer()``.
     """
 
     name = "pbl"
@@ -128,7 +128,7 @@ class Pbl(Simulator):
 
     @property
     def feature_networks(self) -> list[FeatureNetwork]:
-        """Those that the model has, in the order of ``feature_fields``."""
+        """The feature networks that the model has, in the order of ``feature_fields``."""
         return [network for network in (self.surroundings, self.scan_axis) if network is not None]
 
     def printer(self) -> Pbl:
@@ -244,7 +244,7 @@ class Pbl(Simulator):
 class AreawiseNet(nn.Module):
     """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
 
-    ``transposable``: of each kernel is used the mean with its transpose, so that x and y are alike.
+    ``transposable``: each kernel is averaged with its transpose, which treats x and y alike.
     """
 
     def __init__(self, channels: tuple[int, ...], leaky_slope: float, transposable: bool = False):

@@ -29,7 +29,7 @@ Spot = Literal["given", "round", "elliptical"]
 
 
 class PhysicsConfig(SimulatorConfig):
-    """The bare defaults are the form of models frozen before there was a gain; variants set the others."""
+    """The defaults are those of models frozen before there was a gain; variants replace some of them."""
 
     LENGTHS: ClassVar[tuple[str, ...]] = (
         *("sigma_optical_um", "sigma_optical_max_um"),
@@ -37,10 +37,10 @@ class PhysicsConfig(SimulatorConfig):
     )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
-    spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one an axis")
+    spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one per axis")
     sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
-    # The start matters: from a steep threshold in mid-range a fit ends where the projection is a line.
+    # The start matters: from a steep threshold in mid-range a fit ends with a straight projection.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
     alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
     eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
@@ -48,7 +48,7 @@ class PhysicsConfig(SimulatorConfig):
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
     gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
-    # The equations are in µm with 1, and in the full height without: the paper has none.
+    # With 1 the equations are in µm, with None in full heights; the paper has no such height.
     reference_height_um: float | None = Field(
         None, gt=0, description="height that is 1; None: the highest level"
     )
@@ -80,8 +80,8 @@ class Physics(Simulator):
 
     In ``default`` H₀ is the nominal full height and g a gain, without which a full level would be pinned to
     H₀ + b. ``paper`` and ``authors`` have neither: H₀ is 1 µm and g is 1.
-    Below 0 the threshold lies before the first level, and the projection is the concave part of the tanh
-    alone. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the fixed reference 0 ... 1
+    With a threshold below 0, before the first level, the projection is the concave part of the tanh alone.
+    S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the fixed reference 0 ... 1
     (``default``), the range of the image (``paper``) or its maximum (``authors``). The last two depend on
     the crop.
     """
@@ -169,11 +169,11 @@ class Physics(Simulator):
         dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
         return self._develop(crop_border(initial, margin), crop_border(dose, margin), values)
 
-    # The parts take the values, which a pass works out once: in forward mode a sum with a number is slow.
+    # The methods below take the values, computed once per pass: in forward mode every operation is slow.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        # In float32 a width is never quite itself: its last digits must not move the edge of the kernel.
+        # Float32 rounds a width; its last digits must not move the edge of the kernel.
         widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
         spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (

@@ -13,17 +13,17 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 
 class PrinterConfig(SimulatorConfig):
-    """The parts in their order, and where their numbers are or start, ``part.number`` to value.
+    """The parts in order, and the values (fixed or initial) of their numbers, by ``part.number``.
 
     A number may be set like a field of its own: ``spot.sigma_um``.
     """
 
-    parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names, as the light goes")
-    numbers: dict[str, float] = Field({}, description="those that do not start where the part says")
+    parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names in order of action")
+    numbers: dict[str, float] = Field({}, description="values in place of the part's own")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As of every model, with numbers among the fields."""
+        """As for every model, with numbers of parts among the fields."""
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
         parts = fields.get("parts", cls.model_fields["parts"].default)
@@ -98,7 +98,7 @@ class Printer(Simulator):
 
 
 def _key(name: str) -> str:
-    """Of a number among parameters, whose names take no full stop."""
+    """Name of a number as a parameter, in which a full stop is not allowed."""
     return f"raw_{name.replace('.', '__').replace('-', '_')}"
 
 
@@ -115,7 +115,7 @@ class ElectronBeamConfig(PrinterConfig):
 
 
 class ElectronBeam(Printer):
-    """A film written by electrons, some of which come back, and etched."""
+    """A film written by electrons, with backscattering, and etched."""
 
     name = "e-beam"
     Config = ElectronBeamConfig

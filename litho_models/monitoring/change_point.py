@@ -1,14 +1,14 @@
 """Has the mean of a figure changed since the reference? A test with a stated rate of false alarms.
 
-Every new print is tried as the first of a new level that lasts to the last print: the figures before it, the
-reference among them, against those from it on, by Student's t with the spread pooled. Mean and spread are
-unknown, and the t distribution holds for any number of reference prints; unchanged new prints join the
-reference. This is the likelihood ratio for a step in the mean with unknown parameters (Hawkins, Qiu and Kang
-2003, J. Quality Technology 35, 355). The threshold is in closed form: the comparisons share the rate, which
-then holds for the whole set (Bonferroni), however they are correlated. The shares are unequal. A step is
-promised to be noticed within ``SOON`` prints, so that comparisons of that many prints or more have most of
-the rate; with three new prints the rule comes close to the t test of their mean, beyond which no test goes
-that is not told the spread.
+Each new print is tried as the first after a step that lasts to the last print: Student's t with pooled spread
+compares the figures before it, the reference included, with those from it on. Mean and spread are unknown,
+and the t distribution holds for any number of reference prints; unchanged new prints join the reference. This
+is the likelihood ratio for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
+Technology 35, 355). The threshold has a closed form: the comparisons share the rate of false alarms, which
+then holds for the whole set (Bonferroni), however they are correlated. The shares are unequal: a step should
+be noticed within ``SOON`` prints, so comparisons with at least that many prints from the step on get most of
+the rate. With three new prints the rule is nearly the t test of their mean, the best that is possible without
+knowing the spread.
 """
 
 from typing import NamedTuple
@@ -22,9 +22,9 @@ from litho_data.foundation.kinds import Array
 
 # Prints within which a step is to be noticed.
 SOON = 3
-# Share of the rate of each comparison that leaves out so many prints that the promise is not about it.
+# Share of the rate for each comparison with fewer than ``SOON`` prints from the step on.
 _YOUNG = 0.1
-# A step of more standard errors needs no search.
+# Steps of more standard errors are not searched for.
 _LARGEST = 1e4
 
 
@@ -68,7 +68,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
     Their ratio is a t of n + m - 2 degrees of freedom where nothing has changed.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
-    # About a value within the data, or the sums of squares would lose their digits.
+    # Figures relative to a value within the data: otherwise the sums of squares would lose digits.
     centre = np.mean(series.reference, axis=-1, keepdims=True)
     values = np.concatenate([series.reference - centre, series.new - centre], axis=-1)
     n, m = series.reference.shape[-1], series.new.shape[-1]
@@ -84,7 +84,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """The step that is least like chance, and the chance of one as unlike it in unchanged prints, at most.
+    """The least likely step, and an upper bound for the chance of one as unlikely in unchanged prints.
 
     Args:
         series: values of shape (n,) and (m,), n at least 2, m at least 1.
@@ -100,10 +100,10 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
     """Chance that a rise raises an alarm once ``SOON`` prints show it, or all new ones if these are fewer.
 
-    By the noncentral t of the one comparison that starts with the rise, so at least this.
+    A lower bound, by the noncentral t of the one comparison that starts with the rise.
 
     Args:
-        step: in units of the spread of a figure whose variance is 1, which is not known.
+        step: in units of the (unknown) spread of a figure whose variance here is 1.
         reference_variance: (n,); ``new_variance``: (m,), of Gaussian figures.
         rate: chance of a false alarm in the whole set.
     """

@@ -37,8 +37,8 @@ def check(
         out: result folder.
         reference: store of unchanged prints; by default those in the model's card.
         new: names of prints of ``store`` that are new; its others are then the reference.
-        residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions, of prints
-            that no fit had seen, take the place of the model's.
+        residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions of prints
+            that no fit had seen replace the model's.
         false_alarms: chance that an unchanged data set raises an alarm, over all figures.
         tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
         device: where the model runs.
@@ -72,7 +72,7 @@ def _checked(
 ) -> Check:
     found = gather(frozen, dataset, reference, new, residuals)
     parameters = frozen.card["parameters"]
-    # Of prints that the model has seen, the error is too small to compare others with.
+    # The error on prints that the model has seen is too small to compare new prints with.
     optimistic = wording.too_optimistic(found.reference, parameters)
     figures = [figure for figure in FIGURES if figure.name != "error" or not optimistic]
     judged = judge(

@@ -17,7 +17,7 @@ from litho_models.noise.residuals import read_residuals
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
-# A printer whose heights are half or twice those of its model is another one.
+# Heights below half or above twice the predicted ones come from another printer than the model's.
 _OWN_GAIN = (0.5, 2.0)
 
 
@@ -50,9 +50,7 @@ def gather(
     if reference is not None and new:
         raise InputError("reference", got="a store and --new", wanted="one of the two")
     if residuals and reference is None and not new:
-        raise InputError(
-            "--residuals", got="no prints that they are of", wanted="--reference or --new with it"
-        )
+        raise InputError("--residuals", got="no reference prints", wanted="--reference or --new as well")
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     dropped: list[str] = []
     if new:
@@ -129,7 +127,7 @@ def _rows(
 def _predicted(
     frozen: FrozenSimulator, store: Store, residuals: Sequence[str | Path], dropped: list[str]
 ) -> Iterator[tuple[PrintedScan, np.ndarray, bool]]:
-    """Scans, what is expected of each, and whether the model had not seen it."""
+    """Scans, the map expected of each, and whether the model had not seen the scan."""
     if residuals:
         found = read_residuals(store, residuals, frozen.card["model"])
         yield from ((*pair, found.held_out) for pair in zip(found.scans, found.maps_um, strict=True))
@@ -143,7 +141,7 @@ def _predicted(
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """The scans at the dose that most reference scans have: another dose is another gain by intent."""
+    """The scans at the dose that most reference scans have: another dose changes the gain on purpose."""
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:
         return found
@@ -160,7 +158,7 @@ def _check_apart(dataset: Store, other: Store) -> None:
         raise InputError(
             "reference",
             got=f"scans of {dataset.path} in {other.path} too",
-            wanted="prints that are not checked",
+            wanted="other prints than those checked",
             hint="--new PRINT checks some prints of a store against its others",
         )
 

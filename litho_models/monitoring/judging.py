@@ -20,8 +20,8 @@ class Trend(NamedTuple):
 
     Attributes:
         per_print: change from print to print, with its 95 % interval.
-        p: two-sided chance of as much without a trend.
-        prints_left: so many more prints keep the 95 % bound of the drift within the tolerance.
+        p: two-sided chance of so steep a line without a trend.
+        prints_left: for how many more prints the 95 % bound of the drift stays within the tolerance.
     """
 
     per_print: float
@@ -34,8 +34,8 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     """Trend over all prints, and how far it may be trusted.
 
     Drift is the change since the middle of the reference, where the model was made: the trend times the
-    number of prints since. Its 95 % bound is that of the faster end of the interval of the trend. A steady
-    drift is assumed; a step is what the alarm is for.
+    number of prints since. Its 95 % bound follows from the faster end of the trend's interval. A steady
+    drift is assumed; the alarm is for steps.
 
     Args:
         values: one per print in printing order, (n,), three at least; ``variance``: relative, (n,).
@@ -85,7 +85,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """What each figure has of the rate of false alarms."""
+    """Each figure's share of the rate of false alarms."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

@@ -18,7 +18,7 @@ class Figure(NamedTuple):
     """A figure that is watched.
 
     ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %. ``weight``:
-    its part of the rate of false alarms; what is promised of steps is promised of the gain.
+    its part of the rate of false alarms; the promise about steps is made for the gain.
     """
 
     name: str
@@ -51,7 +51,7 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """One value per print in printing order, the mean over its scans, ``counts`` of them; (n,) each."""
+    """One value per print in printing order, the mean over its ``counts`` scans; (n,) each."""
 
     names: list[str]
     values: np.ndarray
@@ -74,7 +74,7 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Variance of the value of a print with so many scans, in units of a usual one; (n,)."""
+        """Variance of a print's value by its number of scans, relative to that of a usual print; (n,)."""
         if self.within is None:
             return np.ones(len(counts))
         variance = self.between + self.within / counts
@@ -82,7 +82,7 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """The prints in printing order: that of the first scan of each."""
+    """The prints in printing order, by the first scan of each."""
     first: dict[str, tuple[int, str]] = {}
     for row in rows:
         first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
@@ -101,8 +101,8 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Mean and spread over prints, two at least; variance components by one-way analysis of variance.
 
-    A print with one scan varies more than one with four. What of it is the print and what the scan follows
-    from scans of one print; a negative variance between prints counts as 0.
+    A print with one scan varies more than one with four. Prints with several scans tell how much of it
+    comes from the scans; a negative variance between prints counts as 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -115,7 +115,7 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     if scans == n:
         return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
     within = rest / (scans - n)
-    # The variance of the means of prints is that between prints and the mean share of the scans.
+    # The variance of the means of prints is that between prints plus the mean part of the scans.
     between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
@@ -143,10 +143,10 @@ class Alarm(Record):
 class FigureCheck(Record):
     """One figure of the new prints against the reference; all but ``mean`` are relative, 0.01 is 1 %.
 
-    ``mean`` and ``spread``: of the reference prints. ``p``: chance, at most, that unchanged prints look as
-    changed; an alarm at ``alarm_at``, the figure's share of the rate, or less. ``noticeable_step``: the rise
-    r that three new prints show in 9 of 10 cases (all new ones, if these are fewer), and so is a fall by
-    r/(1 + r); None where it is beyond a factor of e. ``trend``: change per print over all prints.
+    ``mean`` and ``spread``: of the reference prints. ``p``: upper bound for the chance that unchanged prints
+    look as changed; an alarm is raised if it is at most ``alarm_at``, the figure's share of the rate.
+    ``noticeable_step``: the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
+    cases, as is a fall by r/(1 + r); None beyond a factor of e. ``trend``: change per print over all prints.
     ``measure_again_in``: prints until the 95 % bound of the drift reaches ``tolerance``.
     """
 
@@ -170,7 +170,7 @@ class FigureCheck(Record):
 class Check(Result):
     """``check.json``; ``verdict`` is for people, ``alarm`` for machines.
 
-    ``false_alarm_rate``: chance that a data set like this of an unchanged printer raises an alarm.
+    ``false_alarm_rate``: chance that such a data set from an unchanged printer raises an alarm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/check/2"

@@ -33,7 +33,7 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.table(
         result.figures,
         "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed, whichever print "
-        f"is the first; an alarm at alarm_at or less, the figure's share of {result.false_alarm_rate:g}.",
+        f"is the first; alarm if at most alarm_at, the figure's share of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
         columns=_COLUMNS,

@@ -11,9 +11,9 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# A layout this much flatter, higher or steeper than every one of the reference is of another kind.
+# A layout this much flatter, higher or steeper than every reference layout is of another kind.
 _OTHER_KIND = 1.1
-# Optimism of a fit, in spreads, that a rate of false alarms still bears.
+# Largest optimism of a fit, in spreads, with which the rate of false alarms still holds.
 _BEARABLE_OPTIMISM = 0.25
 
 
@@ -54,7 +54,7 @@ def optimism(reference: Sequence[ScanFigures], parameters: int) -> float:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Whether errors of the reference are too small to compare those of prints not seen with."""
+    """Whether the reference's errors are too small to compare errors on unseen prints with."""
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))
     return optimism(reference, parameters) > _BEARABLE_OPTIMISM * spread
 

@@ -40,7 +40,7 @@ def analyse_noise(
             ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold;
             several of one kind are taken as an ensemble.
         model: which model of the benchmarks; their best one by default.
-        seed: of the pixels drawn.
+        seed: decides which pixels are drawn.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.
@@ -56,7 +56,7 @@ def analyse_noise(
         spread = read_residuals(dataset, residuals, model) if residuals else None
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # A dose often has one print, without which it is lost, and no model is judged by the matrix.
+        # A dose often has one print only, and the matrix judges no model: so it uses locked scans too.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
@@ -98,7 +98,7 @@ def analyse_noise_of_files(
     size_um: tuple[float, float] | None = None,
     level_height_um: float = 0.1,
 ) -> NoiseAnalysis:
-    """The same from single scans, without a store.
+    """Analyse the noise from single scans, without a store.
 
     Args:
         out: result folder.

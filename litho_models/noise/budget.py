@@ -1,7 +1,7 @@
 """The noise of prints that were not made to measure it, from the out-of-fold residuals of a model.
 
-Two estimates that err on the same side: what differs between like surroundings (``estimated_floor``), and how
-rough the places are where the layout is flat, so that a model has little to get wrong.
+Two estimates, too high rather than too low: what differs between like surroundings (``estimated_floor``), and
+the roughness where the layout is flat, so that a model has little to get wrong.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _FARTHEST_PX = 40
 class FlatLevel(Record):
     """Residual where the layout is flat, pixels of one level: rms and mean absolute value, nm.
 
-    Each scan is freed of policy ``full+rows``. ``ci95_nm``: of σ, over prints.
+    Each scan is freed of policy ``full+rows``. ``ci95_nm``: interval of σ over prints.
     """
 
     level: int
@@ -38,7 +38,7 @@ class FlatLevel(Record):
 class NoiseBudget(Record):
     """What the prints say about their own noise; both parts are upper estimates.
 
-    ``flat_levels`` are of the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
+    ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
     ``flat_texture`` is of the same pixels of all scans, freed of policy ``full``: lines are left in.
     ``flat_length_um`` (y, x): distance over which the correlation of these falls to 1/e; None in older files.
     """

@@ -31,11 +31,11 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
-# Their roughness is correlated over ten pixels and more: more of them tell nothing new.
+# Roughness is correlated over ten pixels and more, so that more pixels tell nothing new.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
-# What the groups of pixels are judged at: one and two σ of a Gaussian.
+# Coverage levels at which groups of pixels are judged: one and two σ of a Gaussian.
 _GROUP_LEVELS = (0.68, 0.95)
 # Share of scans that the scan-level factor promises to hold; it takes nine scans to promise 90 %.
 CONFORMAL_LEVEL = 0.9
@@ -45,7 +45,7 @@ _MEANS = ("nll", "crps_nm", "ence", "ause")
 class ScanCalibration(Record):
     """One scan: likelihood and CRPS (nm, lower is better), coverage at the levels stated, rms of r/σ.
 
-    ``factor_90`` is what the scale has to be multiplied by for 90 % of this scan's pixels to be covered;
+    ``factor_90``: factor on the scale with which 90 % of this scan's pixels are covered;
     ``ence`` and ``ause`` are shares (see ``spread_scores``), None in older result files.
     """
 
@@ -60,12 +60,12 @@ class ScanCalibration(Record):
 
 
 class Calibration(Record):
-    """A description of the spread and how it holds on prints that it was not fitted on.
+    """A description of the spread and how well it holds on prints that it was not fitted on.
 
     Args:
         name: constant, by covariates, or with the ensemble's disagreement added.
         nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
-        pit: histogram of the distribution at r/s in 20 equal bins, sums to one; flat if the shape is right.
+        pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
         conformal_factor: scale times this covers 90 % of the pixels in 90 % of new scans, the scan being
             the exchangeable unit; None with fewer than nine scans.
     """
@@ -105,10 +105,10 @@ class SigmaBin(Record):
 
 
 class SpreadAnalysis(Record):
-    """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all.
+    """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all scans.
 
-    ``nuisance``: what the residuals were freed of; an offset only in older result files. ``left_out``: what
-    was left out of a fit to be judged with it.
+    ``nuisance``: what the residuals were freed of; in older result files an offset only. ``left_out``: the
+    prints or scans that are left out of each fit to judge it.
     """
 
     model: str
@@ -125,7 +125,7 @@ class SpreadAnalysis(Record):
 
 
 class Stated(NamedTuple):
-    """What is said of the residual of one scan: its scale at each pixel, nm, and the shape over it."""
+    """The stated distribution of one scan's residual: its scale at each pixel, nm, and its shape."""
 
     scale_nm: Array
     tails: Tails

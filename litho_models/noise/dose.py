@@ -13,9 +13,9 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT, pooled_sd
 
-# Off every change of level by four σ of the optical spot and two of a diffusion of 0.5 µm.
+# Distance from every change of level: four σ of the optical spot, two of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step that prints at less than half of what the steps of its dose usually do is lost.
+# A step is lost if it prints less than half the usual height of its dose's steps.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
@@ -40,9 +40,9 @@ class DoseRow(Record):
         height_gain: printed over nominal height, slope of a straight line through the levels.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation within areas of one level.
-        lost_low, lost_high: steps at the low and at the high end, per level under half the median step of
-            this dose: under-exposure (nothing is left there) and over-exposure (the resist has no more to
-            give). Relative to the dose's own steps, so that shrinkage does not count as exposure.
+        lost_low, lost_high: number of steps at the low and the high end that are, per level, less than half
+            the median step of this dose: from under-exposure (nothing is left) and over-exposure (nothing
+            more reacts). Relative to the dose's own steps, so that shrinkage does not count as exposure.
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
 
@@ -72,8 +72,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     """Judge the doses of the scans that carry one; notes say what is not judged, and why.
 
     A dose without three levels that have areas wide enough to measure on is left out; fewer than two doses
-    make no matrix. Recommended is, among the doses that lose the fewest steps at either end, the one whose
-    height comes nearest to the nominal one.
+    make no matrix. The recommended dose is, among those that lose the fewest steps at either end, the one
+    whose height comes nearest to the nominal one.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
@@ -143,8 +143,8 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
         y, x = np.nonzero(inside)
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
-        # One height per level, one tilt, and what higher or lower surroundings add: all three are told
-        # apart by how the height runs within the treads.
+        # One height per level, one tilt, and what higher or lower surroundings add: how the height
+        # runs within the treads tells all three apart.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
         others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)

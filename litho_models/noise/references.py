@@ -24,7 +24,7 @@ from litho_models.noise.texture import Texture, texture
 from litho_models.scoring.statistics import interval, rms
 
 _SQUARE_WITHIN = 0.01
-# That two prints of one layout must have in common.
+# Pixels that two prints of one layout must have in common.
 _FEWEST_PIXELS = 64
 
 
@@ -99,13 +99,13 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
 
 def _has_texture(one: Reference) -> bool:
-    """Enough lines, on square pixels."""
+    """Whether a scan has enough lines, on square pixels."""
     pitch_y_um, pitch_x_um = one.pitch_um
     return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
 
 
 class RepeatedPrints(Record):
-    """Noise of one print, nm: print and microscope, and at edges registration.
+    """Noise of one print, nm: from print and microscope, and at edges from registration.
 
     Each pair is freed of a polynomial of second degree, so datum, tilt and bow are not in it, nor is what
     repeats from print to print. ``ci95_nm`` resamples pairs.

@@ -55,7 +55,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
 
 
 def noise_verdict(floor: NoiseFloor) -> str:
-    """What of a model's error is noise, in one sentence."""
+    """How much of a model's error is noise, in one sentence."""
     return filled(Path(__file__).with_name("verdict.jinja"), floor=floor).strip()
 
 
@@ -92,9 +92,9 @@ def _texture(page: Page, found: Texture) -> None:
     page.table(
         found.lines,
         f"Strength of the direction {found.strength:.2f}: 0 where all directions are alike (chance of as "
-        f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: of the variance, in the means "
-        "of the lines along each axis; of their squares, in the strongest period. p: chance of such a peak "
-        "in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
+        f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: part of the variance that is "
+        "in the means of the lines along each axis; part of their squares in the strongest period. p: "
+        "chance of such a peak in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
         f"texture_{found.id.replace(' ', '_')}.csv",
         digits=3,
     )
@@ -181,8 +181,8 @@ def _budget(page: Page, found: NoiseBudget) -> None:
     page.heading("Noise budget", folded=True)
     page.paragraph(
         f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
-        "the model lacks counts as noise unless like surroundings share it. What levelling took out of the "
-        "scans before is missing, a few percent of the variance."
+        "the model lacks counts as noise unless like surroundings share it. What levelling removed from the "
+        "scans is missing, a few percent of the variance."
     )
     if found.floor.by_policy:
         page.table(

@@ -87,7 +87,7 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
 def disagreement_um(predictions_um: Sequence[Array]) -> Array:
     """Standard deviation of the members at each pixel, each freed of its own mean: a datum is arbitrary.
 
-    ``(ny, nx)`` µm, with the n − 1 of a sample.
+    ``(ny, nx)`` µm, as of a sample (n − 1).
     """
     stack = np.stack([prediction - prediction.mean() for prediction in predictions_um]).astype(np.float64)
     return stack.std(axis=0, ddof=1)

@@ -36,7 +36,7 @@ class NoiseAnalysis(Result):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """The floor: of repeats, else of a flat print, else what the residuals of a model say."""
+    """The floor: from repeats, else from a flat print, else from the residuals of a model."""
     if repeats is not None:
         return NoiseFloor(
             mae_nm=repeats.mae_nm,

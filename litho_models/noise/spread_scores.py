@@ -25,7 +25,7 @@ class Tails:
     freedom: float = float("inf")
 
     def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
-        """Log density per pixel; residual and scale in one unit, which decides the zero."""
+        """Log density per pixel; its zero depends on the common unit of residual and scale."""
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: Array) -> Array | float:
@@ -39,11 +39,11 @@ class Tails:
 
     @property
     def sd(self) -> float:
-        """Standard deviation over the scale; more than two degrees of freedom."""
+        """Standard deviation over the scale; it takes more than two degrees of freedom."""
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Distribution of z; of a residual over its scale it is uniform where both are right (PIT)."""
+        """Probability below z; uniform for residuals over their scale if scale and shape are right (PIT)."""
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
@@ -89,11 +89,11 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
-    """AUSE: what the mean ``|r|`` is above the best possible while the pixels of largest σ are taken away.
+    """AUSE: excess of the mean ``|r|`` over the best possible while the pixels of largest σ are removed.
 
-    Area between the two curves over the share taken away, 0 to 1, in units of the mean ``|r|`` of all pixels;
+    Area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of all pixels;
     0 where σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels of one σ count with
-    their mean, as in any order of them.
+    their mean, so that their order does not matter.
 
     Args:
         residual, sigma: (pixels,), one unit; not all residuals zero.

@@ -16,7 +16,7 @@ from litho_models.scoring.statistics import rms
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
-# Kept off each edge: three σ of the printer's blur at least.
+# Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
 # Side of the squares whose means are compared.
 _AREA_UM = 1.0
@@ -77,7 +77,7 @@ def step_print(
         scan_id: name in the result.
         height_um: (ny, nx), µm; NaN where not measured.
         pitch_um: (y, x) sampling, µm.
-        level_height_um: nominal step; an edge counts if it parts treads by half of it.
+        level_height_um: nominal step; an edge counts if its treads differ by at least half of it.
 
     Raises:
         InputError: no step found.
@@ -131,8 +131,8 @@ def step_print(
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
     """The axis of a staircase and the pixels at which a new tread starts, ascending.
 
-    The profile of medians is cut into constant pieces with the least squared error, each edge paid
-    for: it has to save as much as two treads of the narrowest width do that differ by half a level.
+    The profile of medians is cut into constant pieces with the least squared error. Each edge has a
+    price: it has to save what an edge between two narrowest treads that differ by half a level saves.
 
     Raises:
         InputError: no edge along either axis.
@@ -228,6 +228,6 @@ def _sigma_of_block_means(flat: Array, treads: list[slice], block: tuple[int, in
 
 
 def pooled_sd(parts: Sequence[Array]) -> float:
-    """Standard deviation within parts that have a mean each; 0 where no part has two values."""
+    """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

@@ -19,11 +19,11 @@ class Period(Record):
 
     Args:
         period_um: distance at which lines repeat.
-        share: of the squares of the lines' means.
+        share: its part of the squares of the lines' means.
         p: chance of such a peak anywhere in a smooth spectrum.
         amplitude_nm: root mean square over the surfaces.
         coherence: 1 if the surfaces have one phase, in the frame that they are given in.
-        coherence_p: chance of as much for surfaces with phases of their own (Rayleigh's test); None for one.
+        coherence_p: chance of so much with independent phases (Rayleigh's test); None for one surface.
     """
 
     period_um: float
@@ -39,9 +39,9 @@ class Lines(Record):
 
     Args:
         along: ``x`` (rows) or ``y`` (columns).
-        share: of the variance of the surface that is in the means of the lines. A surface without lines has
+        share: part of the surface's variance that is in the means of the lines. A surface without lines has
             a share too: compare the two axes.
-        period: the strongest of these means; None below 64 lines.
+        period: the strongest one of these means; None below 64 lines.
     """
 
     along: str

@@ -1,8 +1,8 @@
 """σ(x): how the spread of a residual depends on the layout and the place, as a log-linear scale.
 
-The mean comes first and stays as it is; then ln s² = X β is fitted to its out-of-fold residuals by maximum
-likelihood, with the tails of Student's t. In two stages the spread cannot flatter the mean, and with some
-tens of scans a few covariates are all that can be known (compare Seitzer et al. 2022, arXiv:2203.09168).
+The mean is fitted first and then kept; ln s² = X β is fitted to its out-of-fold residuals by maximum
+likelihood, with the tails of Student's t. Fitted in two stages, the spread cannot excuse errors of the mean;
+tens of scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
 import numpy as np
@@ -13,9 +13,9 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
 
-# What may matter, each a map over the scan; the slope also squared, the radius also to the fourth power.
+# Maps that σ may depend on; the slope is also taken squared, the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
-# Straight lines in between: rare levels at both ends are twice as rough as the middle.
+# Linear between the knots: rare levels at both ends are twice as rough as the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
 COVARIATES = (
     *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
@@ -38,9 +38,9 @@ _STEPS = 60
 class VarianceModel(Record):
     """ln s² = Σ β_j φ_j, s in nm; ``coefficients`` in the order of ``covariates``.
 
-    Level on 0 ... 1 of the range, between knots on a straight line; slope of the blurred layout (height over
+    Level on 0 ... 1 of the range, linear between knots; slope of the blurred layout (height over
     length); distance to the next change of level, at most 2 µm, in units of that; radius from the field's
-    centre in units of half its diagonal. ``freedom``: of Student's t, whose scale s is; None for a Gaussian.
+    centre in units of half its diagonal. ``freedom``: of Student's t with scale s; None for a Gaussian.
     """
 
     covariates: list[str]

@@ -20,7 +20,7 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import RULES, held_out_maps
+from litho_models.loop.fits import RULES
 from litho_models.loop.learner import Learner
 from litho_models.loop.model import Twin
 from litho_models.loop.record import CloseLoop
@@ -85,7 +85,7 @@ class _Asking:
     def __init__(self, closed: Closed, report: Callable[[str], None]):
         self.closed, self.study, self.report = closed, closed.study, report
         self.twin = closed.final.twin.ungrouped()
-        self.maps = held_out_maps(closed.final.per_fold, closed.study, closed.study.scans)
+        self.maps = closed.final.maps_um(closed.study.scans)
         self.left_nm = self._left_by(self.maps)
         self.noise = noise_spectrum(self.left_nm)
 
@@ -161,8 +161,7 @@ class _Asking:
         |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a. What groups differ by is
         in d: one more of them does not make its prints contradict each other.
         """
-        other = self.closed.final.without(name, self.study)
-        without = held_out_maps(other.per_fold, self.study, self.study.scans)
+        without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
         for before, after in zip(self._left_by(without), self.left_nm, strict=True):
             change = np.nan_to_num(before - after)

@@ -19,7 +19,7 @@ _RESET_PEAK = "5"  # see proc(5): the peak of resident memory starts again from 
 
 
 class PredictionCost(Record):
-    """Medians over scans; memory is what a prediction takes beyond what is held anyway, None if not known."""
+    """Medians over scans; memory is what a prediction needs beyond what was in use; None if not known."""
 
     seconds_per_scan: float
     peak_memory_mib: float | None
@@ -56,7 +56,7 @@ def measured_predictions(
 
 
 def _start_of_peak(device: str) -> int | None:
-    """Bytes in use, from which the peak counts anew; None where the peak cannot be reset."""
+    """Bytes in use, from which the peak is counted again; None where the peak cannot be reset."""
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()

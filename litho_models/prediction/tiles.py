@@ -30,7 +30,7 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
 
     A field larger than ``tile_px`` is computed tile by tile, each with the receptive radius around
     it, which gives the same heights as the whole field at once. A model without a receptive radius
-    decides itself.
+    predicts the field in its own way.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -69,8 +69,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
     """Height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the layout.
 
-    The border is less than half the layout. As ``predict_field`` without its border, of which only what the
-    rest needs is computed where the model allows that: see ``FrozenSimulator.inside``.
+    The border is less than half the layout. The result is that of ``predict_field`` without its border; if
+    the model allows it, only what the result needs is computed: see ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
     if reach is None:

@@ -60,7 +60,7 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """How many parts of the other each part of one touches, for the parts of either that are large enough."""
+    """For each large enough part of either film, the number of parts of the other film that it touches."""
     from scipy.ndimage import label
 
     labels = [label(one)[0] for one in (first, second)]
@@ -70,7 +70,7 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
     real = large[0][pairs[0]] & large[1][pairs[1]]
     touched = [np.bincount(own, minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
     counted = [np.bincount(own[real], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
-    # One that touches small parts only has a partner, but joins nothing.
+    # A part that touches small parts only has a partner but joins nothing.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

@@ -15,7 +15,7 @@ from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
-# More come from scans less alike, fewer leave the product of two of them noisy.
+# More partners would come from scans less alike; with fewer the products of two would be noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
@@ -25,7 +25,7 @@ class LikePixels(NamedTuple):
 
     Attributes:
         owner: number of the scan of each pixel, (n,); ``pixel``: its flat index in that scan, (n,).
-        partners: positions in these arrays, (n, m); no two of a row are of one scan.
+        partners: positions in these arrays, (n, m); no two in a row are from one scan.
     """
 
     owner: Array
@@ -33,15 +33,15 @@ class LikePixels(NamedTuple):
     partners: Array
 
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
-        """What each pixel says of the variance of its noise, and its residual squared, (n,) each.
+        """Each pixel's estimate of the variance of its noise, and its squared residual, (n,) each.
 
-        With residuals r₀ and r₁ ... r_m, each a misfit that like surroundings share and noise, the mean of
-        (r₀ − r_j)(r₀ − r_k), j ≠ k, is the variance of the noise in r₀ alone, whatever that of the partners:
-        rare surroundings, which are rougher, find commoner partners, and half a squared difference would be
-        too small there.
+        Each residual r₀, r₁ ... r_m is noise plus a misfit that like surroundings share. The mean of
+        (r₀ − r_j)(r₀ − r_k), j ≠ k, is then the variance of the noise in r₀ alone, whatever the noise of the
+        partners. Half a squared difference would be too small for rare surroundings: they are rougher than
+        the commoner ones that become their partners.
 
         Args:
-            residuals: of each scan, (ny, nx); the unit of the result, squared.
+            residuals: one map per scan, (ny, nx); the result is in their unit squared.
         """
         value = np.empty(len(self.owner))
         for number, residual in enumerate(residuals):
@@ -55,12 +55,12 @@ class LikePixels(NamedTuple):
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
     """Draw pixels and find for each those of other scans whose layout surroundings are most like its own.
 
-    Scans of different doses differ where their layouts do not: only prints of one dose are compared.
+    Scans of different doses differ even where layouts are alike: only prints of one dose are compared.
 
     Args:
-        scans: at least three of one dose, with layouts that vary; otherwise None comes back.
+        scans: at least three of one dose, with layouts that vary; otherwise the result is None.
         scored: bool (ny, nx), which pixels count.
-        seed: of the pixels drawn.
+        seed: decides which pixels are drawn.
     """
     from scipy.spatial import cKDTree
 

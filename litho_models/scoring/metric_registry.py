@@ -1,7 +1,7 @@
 """Metrics of a scan besides its errors: each states its name, unit and meaning once; every report shows it.
 
 A metric sees one scan, what the model expects of it, and the residual freed of the scan's nuisances. Those
-that come with the package are fields of the results; one's own are listed there under ``metrics``.
+that come with the package are fields of the results; registered ones are listed there under ``metrics``.
 """
 
 import math
@@ -35,9 +35,9 @@ class Metric(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Metrics that one function gives together, in this order, and what they are, in a sentence.
+    """Metrics that one function returns together, in this order, and a sentence that explains them.
 
-    ``instrument``: the kind whose scans have them; all, if empty.
+    ``instrument``: the kind whose scans have them; all kinds if empty.
     """
 
     metrics: tuple[Metric, ...]
@@ -91,7 +91,7 @@ def register_metric(
         name: letters, digits and underscores; ``unit``: ``1`` if it has none.
         function: as above.
         explanation: a sentence for the report.
-        over_scans: what a model gets: the mean of what is known, or the sum.
+        over_scans: value for a model: the mean of the known values of its scans, or their sum.
 
     Raises:
         InputError: a name or unit that is no identifier, a name that is taken, or another summary.

@@ -13,7 +13,7 @@ from litho_models.scan_terms import POLICIES, Blocks, CrossFit, cross_fit
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
-# The step of index from air to the resist, at a red helium-neon line: where its elements are used.
+# Step of the index from air to resist, at the red helium-neon line, for which the elements are made.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
@@ -49,7 +49,7 @@ def print_gain(
     if power <= 0:
         nan = float("nan")
         return PrintGain(nan, NM_PER_UM * float(y.mean()), nan, nan, nan)
-    # About the mean of the prediction slope and height are estimated independently of each other.
+    # With the mean of the prediction as origin, estimates of slope and height are uncorrelated.
     regressors = np.stack([np.full(x.size, 1 / x.size), (x - middle) / power])
     height, slope = regressors @ y
     residual = y - height - slope * (x - middle)
@@ -108,5 +108,5 @@ def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> 
 
 
 def phase_waves(height_error_um: float) -> float:
-    """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
+    """Phase error, in waves, of light that passes an element whose height is wrong by ``height_error_um``."""
     return height_error_um * INDEX_STEP / WAVELENGTH_UM

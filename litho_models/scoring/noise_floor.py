@@ -53,7 +53,7 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """The floor that stands under errors of this policy; None where it is not known."""
+        """The floor below the errors of this policy; None if it is not known."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
@@ -71,7 +71,7 @@ UNKNOWN_FLOOR = NoiseFloor(
 
 
 class _StatedFloor(Result):
-    """What is read of a noise analysis here: whose it is, and the floor."""
+    """The part of a noise analysis that is read here: its dataset, and the floor."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -112,8 +112,8 @@ def estimated_floor(
     Args:
         model: its name, for ``source``.
         scans: held-out scans; ``maps_um``: what the model expects of each, (ny, nx) µm.
-        blocks: the pixels that terms are fitted on and scored, as for the errors that the floor stands under.
-        seed: of the pixels drawn.
+        blocks: which pixels fit terms and which are scored, as for the errors compared with the floor.
+        seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
 
@@ -142,17 +142,17 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """An upper estimate of the floor, from residuals of scans that a model had not seen.
 
-    Of drawn pixels the part of the squared error that like surroundings do not share is found
-    (``LikePixels``); the errors over all scored pixels times its root are the floor. For the mean absolute
-    error this takes the shape of the noise, E|n|/σ, to be that of the residual, which is noise but for a few
-    percent of its squares: no Gaussian is assumed. A misfit of half the squares and of another shape (Laplace
-    in Gaussian noise or the reverse) would make it wrong by up to 6 %.
+    On drawn pixels ``LikePixels`` finds the part of the squared error that like surroundings do not share.
+    The floor is the error over all scored pixels times the root of this part. For the mean absolute error
+    this assumes that the noise has the shape, E|n|/σ, of the residual, which is noise but for a few
+    percent of its squares: no Gaussian is assumed. If a misfit had half of the squares and another shape
+    (Laplace in Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        freed: of ``freed_by_policy``, ``offset`` among them.
-        seed: of the pixels drawn.
+        freed: from ``freed_by_policy``, including ``offset``.
+        seed: decides which pixels are drawn.
     """
     # In the order of their ids, so that whoever asks about the same scans draws the same pixels.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)

@@ -1,4 +1,4 @@
-"""What one scan says of the state of the printer: gain, error, and of what layout they are."""
+"""What one scan says about the state of the printer: gain, error, and the kind of layout."""
 
 from collections.abc import Sequence
 from typing import Any

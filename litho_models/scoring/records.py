@@ -1,4 +1,4 @@
-"""What is scored and what comes out: a prediction, the scores of a scan and of a model, scores in pairs."""
+"""Records of scoring: a prediction, the scores of a scan and of a model, and two models' paired scores."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PolicyError(Record):
 class MetricValues(Record):
     """Metrics besides the errors, of maps freed of their nuisances (``metric_registry``).
 
-    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``, one's own by name and unit under
+    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``, others by name and unit under
     ``metrics``. None where there was nothing to compare, or in older result files.
     """
 
@@ -169,7 +169,7 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of the same scans, which meet by id: results list them by fold.
+    """Compare the leading errors of the same scans, paired by id because results list them by fold.
 
     Raises:
         InputError: scores of different scans.

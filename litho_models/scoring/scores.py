@@ -15,7 +15,7 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval, rms
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms of their own: only their errors know of a smooth background.
+# Policies without smooth terms of their own: only their errors depend on a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 

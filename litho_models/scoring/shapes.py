@@ -31,8 +31,8 @@ SIMILARITY_TEXT = (
 EDGES_TEXT = (
     "edge_mean and edge_p95 are distances of the measured contours from the predicted ones at the heights "
     f"half way between nominal levels, over the pieces whose partner lies within {SEARCH_UM:g} µm (of a "
-    f"film: at half its height, within {FILM_SEARCH_PX:g} px); the counts are of pieces: of the "
-    "measured contours with and without a partner, of the predicted contours without."
+    f"film: at half its height, within {FILM_SEARCH_PX:g} px); the counts are pieces of the "
+    "measured contours with and without a partner, and of the predicted contours without one."
 )
 
 

@@ -1,5 +1,5 @@
-"""Statistics over scans, or over prints. Pixels of a scan are correlated: what is drawn, and what changes its
-sign, is a whole scan; where scans of one print share its day and batch, a whole print."""
+"""Statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are drawn and change
+sign; where scans of one print share its day and batch, whole prints."""
 
 from collections.abc import Hashable, Sequence
 
@@ -15,12 +15,12 @@ FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
 PERMUTATIONS = 1999
-# Of a 95 % interval; written so, because 0.025 is another number in its last bits.
+# Ends of a 95 % interval, written so because 0.025 differs in its last bits.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
-# Up to so many scans every combination of signs is used. A table of 2^14 rows is the larger for all
-# directions of a screening at once, so that stops one scan earlier than the comparison of two models.
+# Up to this many scans every combination of signs is used. A screening tests all directions at once and stops
+# one scan earlier than a comparison of two models, which halves its table.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
-# The observed signs are among the flips; rounding must not put a sum below itself.
+# The observed signs are among the flips; rounding must not put their sum below the observed one.
 _ROUNDING = 1 - 1e-12
 
 
@@ -38,7 +38,7 @@ def bootstrap_interval(
 ) -> tuple[float, float]:
     """Percentile interval of the mean over scans, resampling whole scans, or whole groups of them.
 
-    With one of them there is nothing to resample: both ends are NaN.
+    A single scan or group cannot be resampled: both ends are NaN.
 
     Args:
         values: one per scan; ``groups``: the print of each scan, if prints are what is resampled.
@@ -101,7 +101,7 @@ def one_sided_flip_p(values: Array) -> float:
 
 
 def smallest_flip_p(count: int) -> float:
-    """Smallest two-sided sign-flip p that so many scans or prints can have: all signs, or their mirror image.
+    """Smallest two-sided sign-flip p of this many scans or prints: two of all combinations of signs.
 
     Six prints cannot go below 2 / 2^6 = 0.031, however large the difference.
     """
@@ -111,7 +111,7 @@ def smallest_flip_p(count: int) -> float:
 class OverUnits(Record):
     """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
 
-    ``count``: of these; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
+    ``count``: of units; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
     interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, all combinations up
     to 14 units and 9,999 random ones beyond, the observed one counted in; not below ``smallest_p``.
     """

@@ -31,7 +31,7 @@ class Split(Record):
 class ScoredSplit(Split):
     """Which scans were scored; ``lock_box_opened``: whether any locked one was.
 
-    ``first_folds``: so many of the folds were made; None for all.
+    ``first_folds``: how many of the folds were made; None for all.
     """
 
     seed: int = 0

@@ -162,7 +162,7 @@ def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str,
         SimpleNamespace(name=name, by=ALL, start=lambda: {"": {"strength": 0.01}})
         for name in (law, "height-power-2")
     ]
-    one, other = (_fitted(state, entering, study) for study in studies)
+    one, other = (_fitted(replace(state, study=study), entering) for study in studies)
     assert set(one) == set(other) == {law, "height-power-2"}
     for name, own in one.items():
         assert all(

@@ -72,7 +72,7 @@ def test_a_begun_folder_is_continued_by_the_same_command_only(tmp_path: Path) ->
         pass
     other = {"dataset": {"name": "prints"}, "settings": {"seed": 1}}
     with (
-        pytest.raises(InputError, match="seed = 0 where now 1"),
+        pytest.raises(InputError, match="seed = 0, but now 1"),
         growing_folder(tmp_path, "sums.json", other),
     ):
         pass

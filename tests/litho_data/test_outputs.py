@@ -49,12 +49,12 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
 
 
 OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "masks": (lambda out: write_layout_set(out, count=1, size_px=64, seed=1), "seed = 0 where now 1"),
+    "masks": (lambda out: write_layout_set(out, count=1, size_px=64, seed=1), "seed = 0, but now 1"),
     "simulate": (
         lambda out: simulate(out, count=1, size_px=64, knobs=["z-gain=0.1"]),
         "settings, knobs",
     ),
-    "simulate twice": (lambda out: simulate(out, count=2, size_px=64), "count = 1 where now 2"),
+    "simulate twice": (lambda out: simulate(out, count=2, size_px=64), "count = 1, but now 2"),
 }
 
 
@@ -76,9 +76,9 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
         ({"prints": 4, "sizes": [1, 2], "cache": None}, ""),
         ({"prints": 4}, "settings, sizes, wanted"),
         (None, "settings, prints, wanted"),
-        ({"prints": 3, "sizes": [1, 2]}, "prints = 3 where now 4 is asked"),
+        ({"prints": 3, "sizes": [1, 2]}, "prints = 3, but now 4 is asked for"),
         ({"prints": 4, "sizes": [1, 3]}, "sizes, wanted"),
-        ({"prints": 4, "sizes": [1, 2], "cache": 1}, "cache = 1 where now None"),
+        ({"prints": 4, "sizes": [1, 2], "cache": 1}, "cache = 1, but now None"),
     ):
         record.write_text(json.dumps({"dataset": {"name": "a"}, "settings": settings}))
         if not differs:
@@ -87,7 +87,7 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
         with pytest.raises(InputError, match=differs):
             require_same(tmp_path, read_record(tmp_path / "plan.json"), now)
     record.write_text(json.dumps({"dataset": {"name": "b"}}))
-    with pytest.raises(InputError, match=r"dataset\.name = 'b' where now 'a'"):
+    with pytest.raises(InputError, match=r"dataset\.name = 'b', but now 'a'"):
         require_same(tmp_path, read_record(tmp_path / "plan.json"), now)
 
 

@@ -65,7 +65,7 @@ def test_exported_files_are_read_by_their_sidecar(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="greys"):
         read_layout(with_sidecar(picture, format="dxf"))
     cv2.imwrite(str(picture), LEVEL.astype(np.uint16) * 5000)
-    with pytest.raises(InputError, match="another file than its sidecar says"):
+    with pytest.raises(InputError, match="a file that its sidecar does not describe"):
         read_layout(picture)
 
 

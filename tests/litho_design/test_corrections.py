@@ -114,4 +114,4 @@ def test_the_table_says_which_corrections_are_worse(rows):
     better[0]["printed_nm"]["corrected"] = 999.0
     told = as_markdown({"rows": better, "size_px": 64})
     assert "corrections 1 print more than 5 % worse" in told
-    assert "best affine (cap by hidden 5" in told
+    assert "whichever is better (cap by hidden 5" in told

@@ -75,7 +75,7 @@ def test_a_folder_of_another_design_says_what_differs(tmp_path):
     design_hologram("ring", "none", tmp_path, settings=made, announce=False)
     again = design_hologram("ring", "none", tmp_path, settings=made, announce=False)
     assert again.settings == made.model_dump(mode="json")
-    with pytest.raises(InputError, match=r"search\.start = 'random' where now 'gs' is asked"):
+    with pytest.raises(InputError, match=r"search\.start = 'random', but now 'gs' is asked for"):
         design_hologram("ring", "none", tmp_path, settings=hologram_settings(changes=TINY), announce=False)
-    with pytest.raises(InputError, match=r"target\.name = 'ring' where now 'chart'"):
+    with pytest.raises(InputError, match=r"target\.name = 'ring', but now 'chart'"):
         design_hologram("chart", "none", tmp_path, settings=made, announce=False)

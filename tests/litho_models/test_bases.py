@@ -132,7 +132,7 @@ def test_what_a_trained_model_lacks_is_added_and_what_it_carries_is_not() -> Non
     study = study_of(planted([(LAW, ALL, {"": STRENGTH})]))
     for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
         start = fit_state(Twin.bare(base), study)
-        found = search(start, study, [get_effect(LAW), get_effect("height-power-2")])
+        found = search(start, [get_effect(LAW), get_effect("height-power-2")])
         assert found.names == names
         assert found.state.twin.own == 0
         # White noise of 4 nm is all that is left.

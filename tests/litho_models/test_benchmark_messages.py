@@ -30,5 +30,5 @@ def test_a_benchmark_is_extended_but_not_replaced_by_another(store, tmp_path):
     litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2)
     with pytest.raises(InputError, match="holds a benchmark of model identity"):
         litho_models.benchmark(store, tmp_path, models=["affine"], folds=2)
-    with pytest.raises(InputError, match="seed = 0 where now 1"):
+    with pytest.raises(InputError, match="seed = 0, but now 1"):
         litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2, seed=1)

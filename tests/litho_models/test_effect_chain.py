@@ -43,16 +43,16 @@ def test_no_measurement_effect_changes_the_process_model(effect, tmp_path) -> No
     typical = {name: p.typical for name, p in effect.parameters.items()}
     on, off = chain_of({**process, effect.name: typical}), chain_of(process)
     assert not torch.equal(on(LAYOUT), off(LAYOUT))
-    measured = {effect.name: on.values()[effect.name]}
-    save_frozen(on.base, tmp_path / "model", process_effects=off.values(), measurement_effects=measured)
+    measured = {effect.name: on.values[effect.name]}
+    save_frozen(on.base, tmp_path / "model", process_effects=off.values, measurement_effects=measured)
     assert torch.equal(load_frozen(tmp_path / "model")(LAYOUT), off(LAYOUT).detach())
     with pytest.raises(InputError, match=f"{effect.name}, whose role is measurement"):
-        save_frozen(on.base, tmp_path / "other", process_effects=on.values())
+        save_frozen(on.base, tmp_path / "other", process_effects=on.values)
 
 
 def test_a_corrected_model_freezes_and_loads_to_the_same_heights(tmp_path) -> None:
     chain = chain_of({"galvo-lag": {"length_um": 0.2, "direction": -1.0}})
-    save_frozen(chain.base, tmp_path / "model", process_effects=chain.values())
+    save_frozen(chain.base, tmp_path / "model", process_effects=chain.values)
     loaded = load_frozen(tmp_path / "model")
     assert torch.equal(loaded(LAYOUT), chain(LAYOUT).detach())
 

@@ -321,9 +321,9 @@ def test_uneven_scanners_of_printer_and_microscope_are_one_formula_until_the_sca
     printed = written(square, values, context)
     # Positions run to the outermost pixels of both; half a field of 36 px is 1.8 µm.
     assert torch.allclose(printed, scanned(square, values, context), rtol=0, atol=1e-12)
-    across = scanned.as_scanned(square, values, replace(context, quarter_turns=1))
+    across = scanned(square, values, replace(context, quarter_turns=1), scanned=True)
     assert float((across - printed).abs().max()) > 1e-3
-    back = scanned.as_scanned(square, values, replace(context, backward=True))
+    back = scanned(square, values, replace(context, backward=True), scanned=True)
     assert torch.allclose(back, written(square, {"strength": -0.03}, context), rtol=0, atol=1e-12)
     # A part of a write field of four times its size is bent as that field is, by c x² / 2R.
     wide = written(square, {"strength": 0.12}, replace(context, field_radius_um=4 * context.radius_um()))

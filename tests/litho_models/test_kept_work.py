@@ -108,7 +108,7 @@ def test_a_killed_run_keeps_its_folder_from_models_that_leave_no_checkpoint(trai
     facts = {"dataset": trained[0].dataset.model_dump(mode="json"), "model": "pbl"}
     facts["config"] = trained[0].config.model_dump(mode="json")
     (tmp_path / BEGUN).write_text(json.dumps({"record": "run.json", **facts}))
-    with pytest.raises(InputError, match="model = 'pbl' where now 'affine'"):
+    with pytest.raises(InputError, match="model = 'pbl', but now 'affine'"):
         train(store, "affine", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [BEGUN, "checkpoint"]
 

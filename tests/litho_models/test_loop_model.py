@@ -56,14 +56,14 @@ def test_the_bare_twin_is_the_base(study) -> None:
 
 
 def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin) -> None:
-    assert twin.slots == (
+    assert twin.slots == [
         Slot(THINNING, "along_x_um", "1"),
         Slot(THINNING, "along_x_um", "2"),
         Slot(THINNING, "along_y_um", "1"),
         Slot(THINNING, "along_y_um", "2"),
         Slot(THINNING, "exponent", None),
         Slot(THINNING, "turn_deg", None),
-    )
+    ]
     assert twin.own == 2
     assert twin.values({"field": "2"}) == {THINNING: thinning(0.2)}
 
@@ -95,7 +95,7 @@ def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> N
 def test_directions_are_chosen_and_never_fitted(study) -> None:
     lag = {"length_um": 0.2, "direction": -1.0}
     twin = Twin.bare(base_model()).with_effect("galvo-lag", ALL, {"": lag})
-    assert twin.slots == (Slot("galvo-lag", "length_um", None),)
+    assert twin.slots == [Slot("galvo-lag", "length_um", None)]
     assert twin.values({}) == {"galvo-lag": lag}
 
 
@@ -107,7 +107,7 @@ def test_effects_act_in_their_order_however_they_came_and_leave_no_trace(twin: T
     )
     assert more.names == ("long-range-proximity", THINNING, "resampling-blur")
     back = more.without("resampling-blur").without("long-range-proximity")
-    assert (back.by, back.choices, back.slots) == (twin.by, twin.choices, twin.slots)
+    assert (back.effects, back.slots) == (twin.effects, twin.slots)
     assert np.array_equal(back.vector, twin.vector)
     with_first = more.without(THINNING)
     assert with_first.own == 2

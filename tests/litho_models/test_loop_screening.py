@@ -24,7 +24,7 @@ def screened(by: str, *strengths: float) -> tuple[Study, State, dict[tuple[str, 
     values = {label: {"strength": one} for label, one in zip(labels, strengths, strict=True)}
     study = study_of(planted([(LAW, by, values)]))
     state = bare_state(study)
-    screening = Screening(state, study, EFFECTS)
+    screening = Screening(state, EFFECTS)
     found = {(name, by): one for name, own in screening.candidates.items() for by, one in own.items()}
     return study, state, found, screening
 
@@ -93,8 +93,8 @@ def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
 
 def test_what_the_base_does_is_no_candidate(in_all) -> None:
     """A gain that all scans share is a number of the base, and what is left of it a gain of each scan."""
-    study, state, _, _ = in_all
-    found = Screening(state, study, [get_effect("vertical-shrinkage")]).common
+    _, state, _, _ = in_all
+    found = Screening(state, [get_effect("vertical-shrinkage")]).common
     assert found["vertical-shrinkage"].retained < 1e-5
 
 
@@ -104,7 +104,7 @@ def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
     thinned = get_effect(name).with_values({"along_x_um": 0.1, "along_y_um": 0.1})
     study = study_of(planted([(name, ALL, {"": thinned})]))
     effects = [get_effect("tip-dilation"), get_effect(name)]
-    found = Screening(bare_state(study), study, effects).common
+    found = Screening(bare_state(study), effects).common
     assert not found["tip-dilation"].allowed
     assert found[name].allowed
     assert found[name].gain_nm2 > found["tip-dilation"].gain_nm2

@@ -34,7 +34,7 @@ def memory(strength: float) -> dict[str, float]:
 
 def found_in(*effects: tuple[str, str, Values], **facts: int) -> Found:
     study = study_of(planted(effects, **facts))
-    return search(bare_state(study), study, CANDIDATES)
+    return search(bare_state(study), CANDIDATES)
 
 
 def added(found: Found) -> dict[str, str]:
@@ -77,12 +77,12 @@ def test_what_only_a_table_describes_enters_the_corrected_model() -> None:
     strengths = {name: 0.03 * (-1) ** number for number, name in enumerate(table.amplitudes)}
     study = study_of(planted([("level-table", ALL, {"": strengths})]))
     state = bare_state(study)
-    found = _in_model(state, describe(state, study, [table], 1), study)
+    found = _in_model(state, describe(state, [table], 1))
     assert found.names == ["level-table"]
     assert state.mse_nm2 > 2 * found.state.mse_nm2
     # All that is left is the noise.
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
-    assert _in_model(state, [], study).state is state
+    assert _in_model(state, []).state is state
 
 
 def test_two_causes_are_found_together_each_with_its_grouping() -> None:
@@ -138,14 +138,14 @@ def test_a_cause_that_another_resembles_is_found(
     )
     study = study_of(scans)
     start = fit_state(Twin.bare(build_model("physics")), study)
-    found = search(start, study, [effect, *map(get_effect, beside)])
+    found = search(start, [effect, *map(get_effect, beside)])
     assert found.names == [name]
     assert found.causes[0].alike == ()
 
 
 def test_no_more_effects_than_asked_for() -> None:
     study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)})]))
-    assert search(bare_state(study), study, CANDIDATES, most=0).names == []
+    assert search(bare_state(study), CANDIDATES, most=0).names == []
 
 
 def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:

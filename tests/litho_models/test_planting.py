@@ -26,7 +26,7 @@ def closed_on(scans: Sequence[PrintedScan]) -> Closed:
     """The search among two laws, and nothing else of the loop."""
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
-    found = search(base, study, [get_effect(LAW), get_effect("height-power-2")])
+    found = search(base, [get_effect(LAW), get_effect("height-power-2")])
     return SimpleNamespace(base=base, given=study, named=found, final=found.state)  # type: ignore[return-value]
 
 
