@@ -19,7 +19,7 @@ from litho_models.loop.fits import State, Study, fit_state, without_terms
 from litho_models.loop.judging import judge
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
-from litho_models.loop.search import Cause
+from litho_models.loop.search import Cause, describe, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
@@ -34,7 +34,8 @@ class Check:
     """What the causes of a model are checked by.
 
     Attributes:
-        state: the model; ``others``: its causes and laws; ``laws``: all that might stand in a cause's place.
+        state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all that might stand in a
+            cause's place.
         left_nm2: what all features of layout and place still explain beside it.
         secants: of the laws.
     """
@@ -42,8 +43,14 @@ class Check:
     state: State
     others: Sequence[Cause]
     laws: Sequence[Effect]
+    tables: Sequence[Effect]
     left_nm2: float
     secants: Secants
+
+    @property
+    def laws_in(self) -> list[str]:
+        """The laws of the model."""
+        return [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
 
     @property
     def study(self) -> Study:
@@ -52,7 +59,7 @@ class Check:
 
     def of(self, cause: Cause) -> Cause:
         """One of the causes, judged with everything else in place."""
-        without = self.state.without(cause.name)
+        without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
@@ -62,6 +69,8 @@ class Check:
             reason = f"not needed beside the others: {unneeded}"
         elif larger:
             reason = f"may only correct the formula of {larger}"
+        elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
+            reason = f"beside {', '.join(self.laws_in)} it takes less than half of what it took without"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
             reason = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
         # A small part of what is left is the little that any columns take of causes that are still missing.
@@ -100,6 +109,20 @@ class Check:
             laws.append(law.name)
             if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
                 return replace(cause, reason=f"short laws do better in its place: {', '.join(laws)}")
+        return cause
+
+    def beside_table(self, cause: Cause) -> Cause:
+        """A cause that stands otherwise, held against a table that takes over twice as much in its place.
+
+        Where such a table leaves nothing to the cause, it is a part of something larger without a name.
+        """
+        least_nm2 = 2 * cause.judgement.gain_nm2
+        for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
+            if table.judgement.gain_nm2 > least_nm2:
+                both = with_table(self.state, table)
+                judged = judge(both.without(cause.name).freed_nm2, both.freed_nm2, self.study)
+                if reason := judged.reason(grouped=cause.by != ALL):
+                    return replace(cause, reason=f"{table.name} takes its place, and more: {reason}")
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:

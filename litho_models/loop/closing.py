@@ -21,7 +21,7 @@ from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.search import Cause, Found, describe, search, untestable
+from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL
 
@@ -144,10 +144,10 @@ def _searched(
         if named.causes:
             in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
             others = [*named.causes, *lawful.causes]
-            check = Check(in_place, others, laws, rest(in_place).mean_nm2, secants)
+            check = Check(in_place, others, laws, tables, rest(in_place).mean_nm2, secants)
             named.causes = [check.of(cause) for cause in named.causes]
             if not any(one.reason for one in named.causes):
-                named.causes = [check.beside_laws(one) for one in named.causes]
+                named.causes = [check.beside_table(check.beside_laws(one)) for one in named.causes]
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return named, lawful, _in_model(lawful.state, described)
@@ -164,7 +164,7 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
     """The model with every table that is confirmed there too, fitted beside all the rest."""
     found = Found(state)
     for table in described:
-        fitted = _with_table(found.state, table)
+        fitted = with_table(found.state, table)
         judgement = judge(found.state.freed_nm2, fitted.freed_nm2, state.study)
         if judgement.passed(grouped=table.by != ALL):
             found.state = fitted
@@ -180,9 +180,4 @@ def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: floa
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:
         return state
-    return _with_table(state, table)
-
-
-def _with_table(state: State, table: Cause) -> State:
-    twin = state.twin.with_effect(table.name, table.by, table.values)
-    return fit_state(twin, state.study, from_here=True)
+    return with_table(state, table)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import t
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
+from litho_models.effects.effect import Knowledge
 from litho_models.fitting.least_squares import Linearised, eliminated, eliminated_sum
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, State
@@ -116,13 +117,16 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[s
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
+    # What another base does not need corrects the form of this one.
+    corrects = effect.knowledge == "cause" and not {*closed.others} <= {*survives_on}
+    knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
         name=cause.name,
         title=effect.title,
-        knowledge=effect.knowledge,
+        knowledge=knowledge,
         role=effect.role if len(roles) == 1 else "undetermined",
         stage=effect.stage,
-        verdict=verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained"),
+        verdict=verdicts.get(knowledge, "confusable" if cause.alike else "explained"),
         by=cause.by,
         strengths=_strengths(closed, cause.name),
         confusable_with=list(cause.alike),

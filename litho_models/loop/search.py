@@ -102,6 +102,12 @@ def describe(
     return found
 
 
+def with_table(state: State, table: Cause) -> State:
+    """A model with such a table beside all the rest, fitted from there."""
+    twin = state.twin.with_effect(table.name, table.by, table.values)
+    return fit_state(twin, state.study, from_here=True)
+
+
 def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None) -> bool:
     study = found.state.study
     effects = [one for one in candidates if one.name not in found.state.twin.names]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop import checking
+from litho_models.loop import checking, results
 from litho_models.loop.checking import FORM_SHARE, Check, reshaped_gain
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import judge
@@ -73,10 +73,66 @@ def test_the_limits_of_a_name_are_those_that_are_written(
         study=study,
     )
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: reshaped_nm2)
-    one = Check(state, [cause], [], left_nm2, None).of(cause)
+    one = Check(state, [cause], [], [], left_nm2, None).of(cause)
     assert one.judgement.gain_nm2 == pytest.approx(10)
     assert said in one.reason
     assert bool(one.reason) is bool(said)
+
+
+STUDY = Study((), np.empty(0))
+
+
+def gaining(name: str, gain_nm2: float) -> Cause:
+    """A cause that takes so much of 100 nm² in each of ten scans."""
+    return Cause(name, ALL, (), judge(np.full(10, 100.0), np.full(10, 100.0 - gain_nm2), STUDY), 0.01, None)
+
+
+def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
+    """A model that leaves so much in each of ten scans, and without any of its effects so much."""
+    return SimpleNamespace(
+        freed_nm2=np.full(10, squares_nm2),
+        twin=SimpleNamespace(exhausts=lambda name: [], slots=()),
+        without=lambda name: leaving(without_nm2),
+        study=STUDY,
+    )
+
+
+@pytest.mark.parametrize(
+    ("before_nm2", "law", "falls"), [(21, True, True), (19, True, False), (21, False, False)]
+)
+def test_a_name_falls_if_laws_beside_it_take_more_than_half_of_its_gain(
+    before_nm2: float, law: bool, falls: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 0.0)
+    cause, other = gaining("slope-thinning", before_nm2), "slope-x-power-1" if law else "write-order-memory"
+    check = Check(leaving(90), [cause, gaining(other, 5)], [], [], 0.0, None)
+    assert bool(check.of(cause).reason) is falls
+
+
+@pytest.mark.parametrize(
+    ("table_nm2", "beside_nm2", "falls"), [(21, 70, True), (21, 80, False), (19, 70, False)]
+)
+def test_a_name_falls_if_a_table_takes_twice_as_much_in_its_place_and_leaves_it_nothing(
+    table_nm2: float, beside_nm2: float, falls: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checking, "describe", lambda *state: [gaining("level-table", table_nm2)])
+    monkeypatch.setattr(checking, "with_table", lambda state, table: leaving(70, beside_nm2))
+    cause = gaining("dose-exponent", 10)
+    reason = Check(leaving(90), [cause], [], [], 0.0, None).beside_table(cause).reason
+    assert bool(reason) is falls
+
+
+@pytest.mark.parametrize(
+    ("survives_on", "knowledge", "verdict"),
+    [(["affine-mtf", "blur-table"], "cause", "explained"), (["blur-table"], "description", "described")],
+)
+def test_a_cause_that_another_base_does_not_need_is_described(
+    survives_on: list[str], knowledge: str, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(results, "_strengths", lambda closed, name: {})
+    closed = SimpleNamespace(others={"affine-mtf": None, "blur-table": None})
+    found = results._found(closed, gaining("dose-exponent", 10), 0.1, survives_on)
+    assert (found.knowledge, found.verdict) == (knowledge, verdict)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +159,7 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     ]
     large, minor = causes
     assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
-    check = Check(state, causes, [], 0.0, None)
+    check = Check(state, causes, [], [], 0.0, None)
     # Beside a law without a name even a tilt is suspect.
     assert check._larger(minor, without[small]) == "slope-x-power-1"
     monkeypatch.setattr(checking, "get_effect", lambda name: get_effect("slope-thinning"))
