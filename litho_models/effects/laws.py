@@ -99,47 +99,67 @@ Facts = tuple[str, str, str, Column]
 
 
 def _columns() -> Iterator[Facts]:
-    places = {"x": "x", "y": "y", "r2": "r²"}
     for axis in _DIRECTIONS:
-        slope = f"∂h/∂{axis}"
-        for power in (1.0, 1.5, 2.0, 3.0):
-            name = f"slope-{axis}-power-{power:g}"
-            yield name, f"|{slope}|^{power:g}", "1", lambda s, a=axis, p=power: s.size(p, a)
-        yield f"rising-slope-{axis}", f"max({slope}, 0)", "1", lambda s, a=axis: s.slope(a).relu()
-        yield f"falling-slope-{axis}", f"max(-{slope}, 0)", "1", lambda s, a=axis: (-s.slope(a)).relu()
+        yield from (_power(axis, power) for power in (1.0, 1.5, 2.0, 3.0))
+        yield from _one_way(axis)
     for axis in ("x", "y"):
-        slope = f"∂h/∂{axis}"
-        yield f"height-times-slope-{axis}", f"h {slope}", "µm", lambda s, a=axis: s.h * s.slope(a)
-        name = f"height-times-slope-size-{axis}"
-        yield name, f"h |{slope}|", "µm", lambda s, a=axis: s.h * s.size(1, a)
-        name = f"curvature-{axis}"
-        yield name, f"∂²h/∂{axis}²", "1/µm", lambda s, a=axis: s.slope(a, s.slope(a))
-        name = f"slope-size-{axis}-times"
-        yield f"{name}-order", f"|{slope}| t", "1", lambda s, a=axis: s.size(1, a) * s.context.order
-        for word, of in places.items():
-            yield f"{name}-{word}", f"|{slope}| {of}", "1", lambda s, a=axis, w=of: s.size(1, a) * s.place(w)
+        yield from _along_axis(axis)
+        yield from (_slope_at(axis, word) for word in ("x", "y", "r²"))
     yield "steepness-power-1", "|∇h|", "1", lambda s: s.size(1, "x", "y")
     yield "steepness-power-2", "|∇h|²", "1", lambda s: s.size(2, "x", "y")
     yield "height-power-2", "h²", "µm²", lambda s: s.h**2
     yield "height-power-3", "h³", "µm³", lambda s: s.h**3
     yield "height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order
-    for word, of in places.items():
-        yield f"height-times-{word}", f"h {of}", "µm", lambda s, w=of: s.h * s.place(w)
+    yield from (_height_at(word) for word in ("x", "y", "r²"))
     for reach_um in _REACHES_UM:
-        mean, near = f"h̄({reach_um:g} µm)", f"surroundings-{reach_um:g}-um"
-        yield near, f"{mean} - h", "µm", lambda s, r=reach_um: s.mean(r) - s.h
-        yield f"height-times-{near}", f"h {mean}", "µm²", lambda s, r=reach_um: s.h * s.mean(r)
-        yield f"above-{near}", f"(h - {mean})²", "µm²", lambda s, r=reach_um: (s.h - s.mean(r)) ** 2
-        name, steps = f"steps-within-{reach_um:g}-um", f"mean of |∇h| within {reach_um:g} µm"
-        yield name, steps, "1", lambda s, r=reach_um: s.mean(r, s.size(1, "x", "y"))
-    for axis in _DIRECTIONS:
-        for length_um in _TAILS_UM[1:]:
-            name, formula = f"along-{axis}-{length_um:g}-um", f"h along {axis} over {length_um:g} µm - h"
-            yield name, formula, "µm", lambda s, a=axis, n=length_um: s.along(a, n) - s.h
-    for side in _SIDES:
-        for length_um in _TAILS_UM:
-            name, formula = f"{side}-{length_um:g}-um", f"h {side} over {length_um:g} µm - h"
-            yield name, formula, "µm", lambda s, a=side, n=length_um: s.beside(a, n) - s.h
+        yield from _nearby(reach_um)
+    yield from (_to_both_sides(axis, length_um) for axis in _DIRECTIONS for length_um in _TAILS_UM[1:])
+    yield from (_to_one_side(side, length_um) for side in _SIDES for length_um in _TAILS_UM)
+
+
+def _power(axis: str, power: float) -> Facts:
+    return f"slope-{axis}-power-{power:g}", f"|∂h/∂{axis}|^{power:g}", "1", lambda s: s.size(power, axis)
+
+
+def _one_way(axis: str) -> Iterator[Facts]:
+    yield f"rising-slope-{axis}", f"max(∂h/∂{axis}, 0)", "1", lambda s: s.slope(axis).relu()
+    yield f"falling-slope-{axis}", f"max(-∂h/∂{axis}, 0)", "1", lambda s: (-s.slope(axis)).relu()
+
+
+def _along_axis(axis: str) -> Iterator[Facts]:
+    yield f"height-times-slope-{axis}", f"h ∂h/∂{axis}", "µm", lambda s: s.h * s.slope(axis)
+    yield f"height-times-slope-size-{axis}", f"h |∂h/∂{axis}|", "µm", lambda s: s.h * s.size(1, axis)
+    yield f"curvature-{axis}", f"∂²h/∂{axis}²", "1/µm", lambda s: s.slope(axis, s.slope(axis))
+    name = f"slope-size-{axis}-times-order"
+    yield name, f"|∂h/∂{axis}| t", "1", lambda s: s.size(1, axis) * s.context.order
+
+
+def _slope_at(axis: str, word: str) -> Facts:
+    name = f"slope-size-{axis}-times-{word.replace('²', '2')}"
+    return name, f"|∂h/∂{axis}| {word}", "1", lambda s: s.size(1, axis) * s.place(word)
+
+
+def _height_at(word: str) -> Facts:
+    return f"height-times-{word.replace('²', '2')}", f"h {word}", "µm", lambda s: s.h * s.place(word)
+
+
+def _nearby(reach_um: float) -> Iterator[Facts]:
+    mean, within = f"h̄({reach_um:g} µm)", f"{reach_um:g}-um"
+    yield f"surroundings-{within}", f"{mean} - h", "µm", lambda s: s.mean(reach_um) - s.h
+    yield f"height-times-surroundings-{within}", f"h {mean}", "µm²", lambda s: s.h * s.mean(reach_um)
+    yield f"above-surroundings-{within}", f"(h - {mean})²", "µm²", lambda s: (s.h - s.mean(reach_um)) ** 2
+    steps = f"mean of |∇h| within {reach_um:g} µm"
+    yield f"steps-within-{within}", steps, "1", lambda s: s.mean(reach_um, s.size(1, "x", "y"))
+
+
+def _to_both_sides(axis: str, length_um: float) -> Facts:
+    name, formula = f"along-{axis}-{length_um:g}-um", f"h along {axis} over {length_um:g} µm - h"
+    return name, formula, "µm", lambda s: s.along(axis, length_um) - s.h
+
+
+def _to_one_side(side: str, length_um: float) -> Facts:
+    name, formula = f"{side}-{length_um:g}-um", f"h {side} over {length_um:g} µm - h"
+    return name, formula, "µm", lambda s: s.beside(side, length_um) - s.h
 
 
 def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
