@@ -67,7 +67,7 @@ def test_an_archive_with_a_path_that_leads_out_is_refused(name: str, campaign: P
         archive.writestr(name, "{}")
     with pytest.raises(InputError, match="names inside the store"):
         open_store(packed)
-    assert any("names inside the store" in str(finding) for finding in verify(packed, data_dir=campaign).findings)
+    assert any("inside the store" in str(finding) for finding in verify(packed, data_dir=campaign).findings)
 
 
 def test_a_name_that_leads_out_is_refused_before_anything_is_written(
