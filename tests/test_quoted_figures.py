@@ -238,7 +238,7 @@ def test_the_page_on_blind_boards_has_the_entries_as_they_were_judged():
     def cell(trial: dict[str, Any] | None) -> str:
         if trial is None:
             return "not run yet"
-        false = [f"false name `{name}`" for name in trial["false_names"]]
+        false = ["false name `{}`".format("` or `".join(name.split(" | "))) for name in trial["false_names"]]
         ratio = trial["errors"]["after_nm"] / trial["errors"]["floor_nm"]
         return ", ".join([*(one["verdict"] for one in trial["outcomes"]), *false, f"{ratio:.2f} ×"])
 
