@@ -5,7 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
 from typer.testing import CliRunner
 
 from litho_data.cli.app import app
@@ -13,6 +15,37 @@ from litho_data.store import open_store
 from tests.litho_data.campaigns import card_text
 
 run = CliRunner()
+
+
+def test_a_recipe_is_suggested_for_the_card_in_a_folder_beside_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Path, ...]] = []
+
+    def suggest(card: Path, folder: Path, *, data_dir: Path) -> SimpleNamespace:
+        asked.append((card, folder, data_dir))
+        left, warned = {"plane": {"P11": 1.25}, "lines": {"P11": 4}}, {"lines": "moves lines"}
+        return SimpleNamespace(left_nm=left, warned=warned, recipe="plane", card="new.toml")
+
+    monkeypatch.setattr("litho_data.making.suggest.suggest_recipe", suggest)
+    words = [
+        "build",
+        "card.toml",
+        "--suggest",
+        "--out",
+        str(tmp_path / "a.zarr"),
+        "--data-dir",
+        str(tmp_path),
+    ]
+    said = run.invoke(app, words).stdout.splitlines()
+    folder = tmp_path / "a-levelling"
+    assert asked == [(Path("card.toml"), folder, tmp_path)]
+    assert said == [
+        "plane: the layout leaves P11 1.2 nm",
+        "lines: the layout leaves P11 4.0 nm (moves lines)",
+        "suggested: plane; build new.toml",
+        f"pictures {folder / 'report.html'}",
+    ]
 
 
 def test_bad_input_is_one_line_and_code_2(tmp_path: Path) -> None:

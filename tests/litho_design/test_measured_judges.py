@@ -17,7 +17,7 @@ from litho_design.images.photograph import PhotoSource, _saturated
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredSource, fitted_background
+from litho_design.judging.measured import MeasuredSource, _without_tip, fitted_background
 from litho_design.judging.photographs import score_hologram_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
@@ -128,6 +128,33 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
     np.savetxt(source.path, (scan + 0.15 * x) * 1e-6)
     with pytest.raises(InputError, match=r"correlation .*--scan-levelling"):
         score_design(printed_design, tmp_path / "no", scan=replace(source, levelling="none"))
+
+
+@dataclass(frozen=True)
+class Widened:
+    """What a scan has that a tip is taken off."""
+
+    height_um: np.ndarray
+
+    def require_pitch(self) -> tuple[float, float]:
+        return 0.1, 0.2
+
+
+def test_a_pillar_is_narrower_without_its_tip_and_as_high():
+    y, x = np.meshgrid(0.1 * np.arange(-20, 21), 0.2 * np.arange(-10, 11), indexing="ij")
+    radius_um = 0.5
+    # A needle of 1 µm, as a paraboloid shows it.
+    scan = Widened(np.maximum(1 - (x**2 + y**2) / (2 * radius_um), 0))
+    freed, found_um, change_um = _without_tip(scan, radius_um)
+    assert (found_um, freed.height_um[20, 10]) == (radius_um, pytest.approx(1))
+    for beside in ((21, 10), (19, 10), (20, 11), (20, 9)):
+        off_um = np.hypot(y[beside], x[beside])
+        # Carried by the needle's foot, √(2R) away.
+        assert freed.height_um[beside] == pytest.approx((1 - off_um) ** 2, abs=1e-6)
+    assert change_um == pytest.approx(np.std(freed.height_um - scan.height_um))
+    assert _without_tip(scan, 0.0) == (scan, 0, 0)
+    with pytest.raises(InputError, match="radius of the tip"):
+        _without_tip(scan, -0.5)
 
 
 def test_a_scan_of_something_else_is_refused(tmp_path, printed_design):
