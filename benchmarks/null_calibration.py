@@ -47,7 +47,7 @@ def main() -> None:
     parser = options(__doc__, "write the figures into the page")
     parser.add_argument("--stores", type=int, default=40)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
+    parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
     parser.add_argument("--cache", type=Path, default=Path("runs/null-calibration"), help="a file per store")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)

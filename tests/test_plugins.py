@@ -131,7 +131,7 @@ def test_a_plugin_that_cannot_be_loaded_is_one_line(tmp_path: Path, unknown: Non
     failing, taken = tmp_path / "own_fault.py", tmp_path / "json.py"
     failing.write_text("1 / 0")
     taken.write_text("")
-    wrong = {tmp_path / "none.py": "none.py", tmp_path: "a file of Python"}
+    wrong = {tmp_path / "none.py": "none.py", tmp_path: "a Python file"}
     for file, said in {**wrong, failing: "ZeroDivisionError", taken: "an unused name"}.items():
         with pytest.raises(InputError, match=said):
             plugins.load_plugins([file])
@@ -141,5 +141,5 @@ def test_a_plugin_that_cannot_be_loaded_is_one_line(tmp_path: Path, unknown: Non
 def test_the_option_stands_anywhere_on_the_line() -> None:
     words = ["--plugin", "one.py", "train", "store", "--plugin=two.py", "--model", "m"]
     assert plugins.without_plugins(words) == (["train", "store", "--model", "m"], ["one.py", "two.py"])
-    with pytest.raises(InputError, match="a file of Python"):
+    with pytest.raises(InputError, match="a Python file"):
         plugins.without_plugins(["train", "--plugin"])

@@ -67,7 +67,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
     parser.add_argument("--workers", type=int, default=1, help="processes side by side, one thread each")
-    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
+    parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
     parser.add_argument("--small", type=int, metavar="PX", help="tiny elements, to try the machinery")
     parser.add_argument(
         "--corrected", type=Path, help="model of a closed loop on the measured prints: one arm more"

@@ -137,7 +137,7 @@ class LayoutFiles(Record):
     def _counted(self) -> Self:
         if self.average_px is not None and self.levels != self.average_px**2 + 1:
             raise ValueError(
-                f"wanted levels = {self.average_px**2 + 1}, the numbers of white pixels in a square"
+                f"wanted levels = {self.average_px**2 + 1}, for 0 to all white pixels in a square"
             )
         return self
 

@@ -141,7 +141,9 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         )
     if not any(one.use == "dataset" for one in fields):
         shown = "; ".join(f"{one.id}: {one.reason}" for one in aside[:3]) or "no ids"
-        raise InputError(f"card {file}: no field to build", got=shown, wanted="a layout and a scan of one id")
+        raise InputError(
+            f"card {file}: no field to build", got=shown, wanted="a layout and a scan with the same id"
+        )
     return Listing(card, file, folder, tuple(fields), tuple(aside), _assumptions(card, table))
 
 

@@ -86,7 +86,7 @@ def build(
         for name, of in found.left_nm.items():
             left = ", ".join(f"{scan} {one:.1f} nm" for scan, one in of.items())
             warned = f" ({found.warned[name]})" if name in found.warned else ""
-            typer.echo(f"{name}: the layout leaves {left}{warned}")
+            typer.echo(f"{name}: not explained by the layout: {left}{warned}")
         typer.echo(f"suggested: {found.recipe}; build {found.card}")
         typer.echo(f"pictures {folder / 'report.html'}")
         return

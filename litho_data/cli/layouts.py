@@ -131,7 +131,9 @@ def simulate(
     from litho_data.virtual_fab.settings import preset as named_preset
 
     if (plan is None) != (fab is None):
-        raise InputError("--plan and --fab", got="one of them", wanted="both: what is printed, and where")
+        raise InputError(
+            "--plan and --fab", got="one of them", wanted="both: the plan to print and the fab that prints it"
+        )
     if plan is not None and fab is not None:
         if (
             layouts is not None

@@ -49,7 +49,11 @@ def tip(
     from litho_data.tip import reconstructed, tip_certain
 
     if len({scan.name for scan in read}) < len(read):
-        raise InputError("--maps", got="scans of one name", wanted="names that differ: they name the maps")
+        raise InputError(
+            "--maps",
+            got="scans with the same name",
+            wanted="different names, as the maps are named after them",
+        )
     maps.mkdir(parents=True, exist_ok=True)
     for scan in read:
         height, pitch = scan.height_um, scan.require_pitch()

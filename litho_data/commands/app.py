@@ -39,7 +39,7 @@ WorkersOption = Annotated[
 DaskOption = Annotated[
     str | None,
     option(
-        "address of a Dask scheduler, such as tcp://host:8786: its workers in the place of --workers",
+        "address of a Dask scheduler, such as tcp://host:8786; its workers replace --workers",
         "--dask",
     ),
 ]

@@ -29,7 +29,7 @@ def setting(
     Args:
         default: its value if none is given; ``...`` if it must be given.
         help: what it is, in a few words without a full stop.
-        unit: of the value, such as µm.
+        unit: unit of the value, such as µm.
         option: name or names on the command line, such as ``--pitch-um``; none for settings that are
             reached by their dotted path only.
         limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); a length in µm is at most the
@@ -65,7 +65,7 @@ class Leaf:
 
 
 def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[Leaf]:
-    """Every setting of a record, including those of its parts."""
+    """Every setting of a record and of its parts."""
     for name, field in type(settings).model_fields.items():
         value, path = getattr(settings, name), f"{prefix}{name}"
         if isinstance(value, BaseModel):

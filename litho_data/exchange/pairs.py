@@ -57,7 +57,7 @@ def import_pairs(
         folder: with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
         out: the store.
         pitch_um, level_height_um, levels: not in the files; by default those of the paper.
-        name: of the dataset, by default the folder's.
+        name: name of the dataset, by default that of the folder.
         workers, dask: as for ``build_dataset``.
         strict: refuse to build if any field has to be skipped.
 

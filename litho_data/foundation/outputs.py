@@ -28,7 +28,9 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
     """
     folder = Path(path)
     if folder.exists() and folder.samefile(Path.cwd()):
-        raise InputError("output", got=f"{folder}, the current folder", wanted="a folder in it, or elsewhere")
+        raise InputError(
+            "output", got=f"{folder}, which is the current folder", wanted="a folder below it, or elsewhere"
+        )
     _refuse_a_file(folder)
     names = sorted(child.name for child in folder.iterdir()) if folder.exists() else []
     strangers = [name for name in names if not any(fnmatch(name, pattern) for pattern in holds)]
@@ -47,7 +49,7 @@ def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
         raise InputError(
             "output",
             got=f"{folder}, which holds a result with other settings, {other.removeprefix('settings.')}",
-            wanted="the same settings, or a folder of its own",
+            wanted="the same settings, or another folder",
             hint="choose another --out, or delete the folder",
         )
 

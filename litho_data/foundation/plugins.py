@@ -30,7 +30,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
     for file in files:
         path = Path(file).absolute()
         if path.suffix != ".py" or not path.is_file():
-            raise InputError("plug-in", got=str(file), wanted="a file of Python")
+            raise InputError("plug-in", got=str(file), wanted="a Python file")
         _load(str(path), file_sha256(path)[:12], lambda path=path: _import(path))  # type: ignore[misc]
 
 
@@ -58,7 +58,7 @@ def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
             continue
         file = file if equals else next(left, "")
         if not file:
-            raise InputError(OPTION, got="none", wanted="a file of Python that registers something")
+            raise InputError(OPTION, got="none", wanted="a Python file that registers something")
         files.append(file)
     return kept, files
 

@@ -30,9 +30,9 @@ def write_card(
 
     Args:
         folder: where the card goes.
-        name: of the dataset; ``title``: one line for people.
-        pitch_um: of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
-        scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: of the files of the microscope.
+        name: name of the dataset; ``title``: one line for people.
+        pitch_um: pitch of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
+        scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: format of the microscope's files.
         levelled: whether a build takes the heights from the files without levelling them.
         tables: further tables of the card, such as ``ids`` and ``write``; a table that is None is left out.
 

@@ -27,7 +27,8 @@ class LayoutStatistics(Result):
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
         power_share: share of the power (mean level excluded) in each bin, sums to 1.
         lag_um: lags of the autocorrelation, µm.
-        autocorrelation_x, autocorrelation_y: of the level about the layout's mean, 1 at lag 0.
+        autocorrelation_x, autocorrelation_y: autocorrelation of the level about the layout's mean, 1 at lag
+            0.
         settings: settings of a set that ``write_layout_set`` made, otherwise None.
     """
 

@@ -96,7 +96,7 @@ def layout_in_scan_frame(
     Args:
         layout_level: (ny, nx) levels.
         scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan's frame to the layout's.
-        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened places.
+        bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
 
     Returns:
         float64 of ``scan_shape``. Nearest pixel: levels are labels and must not be mixed.

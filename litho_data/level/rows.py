@@ -73,7 +73,7 @@ def align_rows(
             keeps large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
             the prevailing slope of each row, found in up to 30 passes.
         direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
-        degree: of the polynomial, 0 to 5.
+        degree: degree of the polynomial, 0 to 5.
         trim: fraction cut at each end by the trimmed means, 0 to 0.5; 0.5 is the median.
         pitch_um: (y, x), needed by ``facet-tilt`` only.
 

@@ -58,7 +58,8 @@ def assemble(
 
     Args:
         root: the growing group.
-        records: of the finished scans, sorted by id, including references (``use`` other than dataset).
+        records: records of the finished scans, sorted by id, including references (``use`` other than
+            dataset).
         load: the arrays of an id on the layout grid.
         source: what the records were made from.
         skipped: per id, why it is not in the store.
@@ -203,7 +204,7 @@ def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[
 
     Args:
         source: the files by id and recorded name, and which have no partner.
-        records: of the finished scans, by id.
+        records: records of the finished scans, by id.
         skipped: per id, why it is not in the store.
 
     Returns:

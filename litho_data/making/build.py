@@ -59,7 +59,7 @@ def build_dataset(
             user cache, whichever has them.
         workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
         strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
-        seed: of the robust registration.
+        seed: seed of the robust registration.
         tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans; it replaces the
             card's. Pixels that the tip may not have touched become invalid.
 

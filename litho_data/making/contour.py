@@ -27,7 +27,7 @@ _LOST = 0.1
 
 
 class Edges(NamedTuple):
-    """``distance_px`` (ny, nx) from the nearest edge, positive on the film; ``sigma_px``: of one edge pixel.
+    """``distance_px`` (ny, nx) from the nearest edge, positive on the film; ``sigma_px``: its sd at a pixel.
 
     ``specks``: bool (ny, nx), dots and pinholes of at most 40 px, which are ignored.
     """
@@ -98,7 +98,7 @@ def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
 
     Args:
         covered: coverage (ny, nx), NaN where not seen; ``layout_share``: coverage by the layout.
-        depth_px: what lies nearer to an edge of the layout may be print; defects are widened by as much.
+        depth_px: nearer to an edge of the layout, deviations may be print; defects are widened by as much.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

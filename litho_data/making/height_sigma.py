@@ -35,7 +35,7 @@ def height_sigma(
         levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
         height_um: the same on the layout's grid, NaN where not valid.
         layout_level: levels on that grid.
-        blur_px, model: of the registration, see ``warp_error``.
+        blur_px, model: blur and model of the registration, see ``warp_error``.
         levelled: whether a recipe was applied. If so, what it removed of the print counts at its estimate; if
             not, a surface beside the print counts only if it is clear.
         fast_axis: the axis along which the tip moved.

@@ -79,7 +79,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     if result.findings:
         page.heading("To do")
         table = [{"scan": one.scan, "what": one.text} for one in result.findings]
-        page.table(table, "What speaks against the dataset, worst first", "findings.csv")
+        page.table(table, "Findings against the dataset, worst first", "findings.csv")
     apart = {"skipped": result.skipped, "unpaired": result.unpaired}
     rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
     if rows:
@@ -104,8 +104,8 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
     if "sigma_nm" in quality:
         page.table(
             quality[list(_COLUMNS["uncertainty"])],
-            "What the uncertainty of the heights is made of: root mean square over a scan, its offset "
-            "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
+            "Parts of the uncertainty of the heights: root mean square over a scan, except for its "
+            "offset. z calibration is 0 if the card has none; the error of the z scale is then missing",
             "uncertainty.csv",
             digits=2,
         )

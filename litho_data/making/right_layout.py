@@ -88,7 +88,7 @@ def fitting_layout(
         height_um: (ny, nx), NaN where not measured.
         scan_pitch_um: (y, x).
         layouts: levels (ny, nx) by id.
-        pitch_um: of the layouts.
+        pitch_um: pitch of the layouts.
     """
     flat = remove_bow(at_layout_pitch(height_um, scan_pitch_um, pitch_um))
     scores = {}

@@ -204,9 +204,7 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
     rows = [
         {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
     ]
-    caption = (
-        "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
-    )
+    caption = "Part of the levelled heights that the layout does not explain, root mean square, nm"
     page.table(rows, caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)

@@ -115,7 +115,7 @@ def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Ite
     if quality.get("polarity") == -1:
         yield "its heights fall where the levels rise: is the layout or the scan inverted?", Weight.LAYOUT
     if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
-        text = f"details lie {off:.1f} px from their place: is it the right layout and pitch?"
+        text = f"details lie {off:.1f} px off their place: is it the right layout and pitch?"
         yield text, Weight.PLACE
     if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
         yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
@@ -153,9 +153,9 @@ def _of_the_card(
     edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
     if edge_times > _EDGE_TIMES:
         text = (
-            f"their outermost pixels lie {edge_times:.0f} times as far from their layouts as the rest: set "
-            "write.surround to substrate if level 0 goes on around a field, else to unknown, which leaves "
-            "these pixels out"
+            f"their outermost pixels deviate {edge_times:.0f} times as much from their layouts as the rest: "
+            "set write.surround to substrate if level 0 continues around a field, else to unknown, which "
+            "leaves these pixels out"
         )
         yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)

@@ -68,7 +68,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
         history = read_steps(store)
         manifest = store.manifest
         if "card" not in manifest:
-            raise InputError(f"manifest of {path}", got="none", wanted="that of its build")
+            raise InputError(f"manifest of {path}", got="none", wanted="the manifest of its build")
         folder = raw_folder(store, data_dir)
     except InputError as error:
         return Verification((*findings, Finding("store", str(error))), (), 0, 0, 0)
@@ -92,7 +92,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
 
 def _missing(path: Path) -> Iterator[Finding]:
     for name in missing_files(path):
-        yield Finding(f"file {name}", "is declared and is not there")
+        yield Finding(f"file {name}", "is declared but missing")
 
 
 def _documents(path: Path) -> Iterator[Finding]:
@@ -137,7 +137,7 @@ def _attributes(store: Store) -> Iterator[Finding]:
     for name in sorted({*wanted, *attributes}):
         if attributes.get(name) != wanted.get(name):
             yield Finding(
-                f"attribute {name}", f"is {attributes.get(name)!r}, by the build {wanted.get(name)!r}"
+                f"attribute {name}", f"is {attributes.get(name)!r}, but the build wrote {wanted.get(name)!r}"
             )
 
 
@@ -160,7 +160,7 @@ def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
         for recorded_id, step in steps:
             where = f"step {step.op} of scan {scan_id}"
             if step.id != recorded_id:
-                yield Finding(where, "operation, parameters or inputs are not those that its id stands for")
+                yield Finding(where, "operation, parameters or inputs do not match its id")
             for one in step.inputs:
                 known = made.get(one["name"], raw.get(one["name"]))
                 if one["sha256"] != known:
@@ -217,7 +217,7 @@ def _coordinates(store: Store) -> Iterator[Finding]:
             continue
         attributes = array_of(store.root, variable.name).attrs
         if variable.name not in MIXED_UNITS and attributes.get("units") != variable.unit:
-            problem = f"is {attributes.get('units')!r}, by the schema {variable.unit!r}"
+            problem = f"is {attributes.get('units')!r}, but the schema says {variable.unit!r}"
             yield Finding(f"unit of {variable.name}", problem)
 
 
@@ -225,7 +225,7 @@ def _other_code(history: Recorded) -> Iterator[str]:
     used = {(step.op, step.code_sha256) for recorded in history.values() for _, step in recorded}
     other = {op for op, code in used if op not in OPERATIONS or code != OPERATIONS[op].code_sha256}
     if other:
-        yield f"made by other code than is installed: {', '.join(sorted(other))}; replay tells if it matters"
+        yield f"made by code other than the installed: {', '.join(sorted(other))}; replay tells if it matters"
 
 
 def _raw_file(folder: Path, row: Mapping[str, Any]) -> Iterator[Finding]:

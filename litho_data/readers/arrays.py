@@ -204,7 +204,7 @@ def refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
         InputError: there is a mask of the map's shape.
     """
     if shape in masks:
-        raise InputError(f"mask {masks[shape]!r}", wanted="NaN where pixels were not measured, and no mask")
+        raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")
 
 
 def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str]) -> Channel:

@@ -48,7 +48,7 @@ def read_scan(
     Args:
         path: the instrument's file.
         format: one of ``formats()``, or ``"auto"`` to detect it from the content.
-        unit: of the heights, needed if the file states none.
+        unit: unit of the heights, needed if the file states none.
         size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
             pitch stays unknown (None).
         channel: which channel; needed if a file has several height channels.

@@ -132,7 +132,7 @@ def refuse_scales(header: Mapping[str, str]) -> None:
     """
     for key, value in header.items():
         if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):
-            raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
+            raise InputError(f"a scale in the header, {key} = {value}", wanted="a known scale")
 
 
 def read_text(path: Path) -> str:

@@ -71,7 +71,7 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
         raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even ones")
     ends = ((values[-1, :-1], values[-2, :-1]), (values[:-1, -1], values[:-1, -2]))
     if all((step := _spacing(line)) and not _goes_on(beside, step) for line, beside in ends):
-        raise InputError("axes in the last row and column", wanted="axes in the first ones, or none")
+        raise InputError("axes in the last row and column", wanted="axes in the first row and column")
     return Map(values)
 
 

@@ -106,7 +106,7 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: 
     if page.photometric.name in ("PALETTE", "MINISWHITE") and dtype.kind in "ui":
         raise InputError(f"{what}: values", got=page.photometric.name.lower(), wanted="larger is higher")
     if hidden := [tag.code for tag in page.tags if _may_hold_heights(tag, shape)]:
-        raise InputError(f"{what}: heights may stand in private tag {hidden[0]} of an unknown maker")
+        raise InputError(f"{what}: heights may be in private tag {hidden[0]} of an unknown maker")
     scale, offset, unit, missing = _calibration(what, page, imagej)
     return Channel(
         name=f"page {index}",

@@ -59,7 +59,7 @@ def find_coarse(
         layout_level: (ny, nx) integer levels.
         smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
         features: whether to match keypoints; on a repeating layout they would match everywhere.
-        seed: of the robust estimators.
+        seed: seed of the robust estimators.
     """
     hypotheses = search_orientation(scan, smooth_layout)
     if not hypotheses:

@@ -52,7 +52,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
         layout_level: (ny, nx) integer levels.
-        seed: of the robust estimator.
+        seed: seed of the robust estimator.
 
     Returns:
         None if there are too few matches or no affine fits them.

@@ -73,7 +73,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     """(passed, reason, warning) for the figures of one registration; the reason names every failure.
 
     Args:
-        figures: of the fit, the warp and the evidence.
+        figures: figures of the fit, the warp and the evidence.
         blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
         bend_um: the bend of the scan in its own frame, if one was fitted.
     """

@@ -80,7 +80,7 @@ def register_scan(
         scan_pitch_um: (y, x) pitch of plain heights.
         model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
         fast_axis: of plain heights, the axis along which the tip moved fast; ``x`` if unknown.
-        seed: of the robust estimator and the bootstrap.
+        seed: seed of the robust estimator and the bootstrap.
 
     Raises:
         InputError: arrays that are not 2-D or smaller than 32 pixels, or pitches that are missing or not

@@ -97,7 +97,7 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
     Args:
         image: (ny, nx), one value per pixel of the picture.
         colours: name of the colour map.
-        low: value of its first colour, ``high``: of its last; values outside get the nearest colour.
+        low, high: values of the first and the last colour; values outside get the nearest colour.
     """
     import matplotlib
     from PIL import Image

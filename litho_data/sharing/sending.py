@@ -103,7 +103,7 @@ def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
         raise InputError(
             f"Dask worker {worker.address}",
             got=f"{worker.state.nthreads} threads",
-            wanted="one, with more workers instead",
+            wanted="one thread; start more workers instead",
             hint="dask worker ADDRESS --nworkers N --nthreads 1",
         )
     if not os.path.isdir(folder):

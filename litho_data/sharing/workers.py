@@ -147,15 +147,14 @@ def _tried(
                     raise InputError(
                         f"the worker of {name(number)}",
                         got=pool.fate,
-                        hint="run it again, it resumes; should memory have run out, with fewer or larger "
-                        "workers",
+                        hint="run it again to resume; if memory ran out, use fewer or larger workers",
                     ) from error
                 lost.append(number)
             else:
                 yield number, answer
         if lost:
             under_way = [number for number in lost if tries[number]]
-            print(f"a worker died: {', '.join(map(name, under_way))} again, alone", file=sys.stderr)
+            print(f"a worker died: running {', '.join(map(name, under_way))} again, alone", file=sys.stderr)
             pool.restart()
             waiting = [number for number in lost if not tries[number]]
             batches = [*([number] for number in under_way), waiting, *batches]
@@ -278,7 +277,7 @@ def _dask(address: str) -> Iterator[Pool]:
                 executor.submit,
                 count,
                 (KilledWorker, CancelledError),
-                "died, as did those that took its place, or Dask's scheduler",
+                "died, as did its replacements, or Dask's scheduler died",
             )
         finally:
             executor.shutdown(wait=False)

@@ -103,7 +103,7 @@ def file_names(path: Path) -> set[str]:
         names = archive.namelist()
     for name in names:
         if name.startswith("/") or _LEADS_OUT.search(name):
-            raise InputError(f"store {path}", got=f"a file {name!r}", wanted="names that stay inside")
+            raise InputError(f"store {path}", got=f"a file {name!r}", wanted="names inside the store")
     return set(names)
 
 
@@ -264,7 +264,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
     transform = samples["scan_to_layout"]
     if not np.isfinite(transform).all() or abs(np.linalg.det(transform)) == 0:
         raise InputError(
-            f"scan_to_layout of {what}", got=transform.tolist(), wanted="a transform that can be undone"
+            f"scan_to_layout of {what}", got=transform.tolist(), wanted="an invertible transform"
         )
 
 

@@ -144,14 +144,12 @@ class _Tops:
             size = 2 * self.half_px + 1
             return f"the noise requires windows of {size} pixels, and the tip reaches over {reach:.1f}"
         if self.share < _TIP_SHARE:
-            return (
-                f"{self.share:.0%} of the sharp tops are as sharp as the sharpest: the surface makes them so"
-            )
+            return f"{self.share:.0%} of the sharp tops are as sharp as the sharpest: the surface limits them"
         agreeing = sum(edge > _AGREEMENT * self.edge for edge in self.edges(_PARTS))
         if self.share * agreeing < _EVERYWHERE * _PARTS**2:
             return (
                 f"{agreeing} of {_PARTS**2} parts of the scan have tops as sharp as the sharpest, and "
-                f"{self.share:.0%} of the sharp tops are: the surface may make them so"
+                f"{self.share:.0%} of the sharp tops are: the surface may limit them"
             )
         valleys = _edge(-self.curvature, self.noise)
         if valleys < _SHARPER_VALLEYS * self.edge:

@@ -21,7 +21,7 @@ class ScanFrame:
         shape: (ny, nx) of the scan.
         pitch_um: nominal pixel pitch, µm.
         scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
-        layout_pitch_um: of the layout, and of the canvas around it, µm.
+        layout_pitch_um: pitch of the layout and of the canvas around it, µm.
     """
 
     shape: Shape

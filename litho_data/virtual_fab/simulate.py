@@ -76,11 +76,13 @@ def simulate(
     require_known("metadata", metadata, ("full", "files-only"))
     if references and metadata != "full":
         raise InputError(
-            "references", got="metadata files-only", wanted="full: only the table tells them apart"
+            "references",
+            got="metadata files-only",
+            wanted="full, because only the table identifies references",
         )
     if references and jobs is not None:
         raise InputError(
-            "references", got="own layouts", wanted="references among them: their use is in the table"
+            "references", got="own layouts", wanted="references among the layouts, by their use in the table"
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -234,7 +236,9 @@ def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: i
     card = Path(plan) / CARD_NAME
     truth = Truth.read(Path(fab) / "truth")
     if seed == truth.seed:
-        raise InputError("seed", got=seed, wanted="another than the earlier run's: the prints are new")
+        raise InputError(
+            "seed", got=seed, wanted="another seed than the earlier run's, as the prints are new"
+        )
     about = load_card(card)
     return simulate(
         out,

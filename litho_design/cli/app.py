@@ -141,7 +141,7 @@ def score(
             "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
         )
     if camera is None and camera_object is not None:
-        raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
+        raise InputError("--camera-object", got="no --camera", wanted="a photograph of the object")
     photo = None
     if camera is not None:
         photo = PhotoSource(

@@ -173,5 +173,7 @@ class Element(nn.Module):
         large = self.tile_px is not None and self.layout.size_px > self.tile_px
         if large and self.printer.depends_on_position:
             raise InputError(
-                "tile_px", got="a model whose print depends on the position", wanted="None: in one piece"
+                "tile_px",
+                got="a model whose print depends on the position",
+                wanted="None, to print in one piece",
             )

@@ -115,7 +115,9 @@ def export(
     if marks:
         if source.design is None:
             raise InputError(
-                "marks", got="levels without a design", wanted="a design, whose printer has a reach"
+                "marks",
+                got="levels without a design",
+                wanted="a design, whose model gives the printer's reach",
             )
         guard_um, heights = source.design.printer.guard_um, source.design.stroke.printed_height_um
         written, found = with_marks(levels, source.layout, guard_um, heights)
@@ -206,7 +208,9 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
     for older in sorted(place.glob("layout.*.json")):
         if older.name != f"{name}.json" and Sidecar.read(older).layout_sha256 != layout_sha256:
             raise InputError(
-                "output", got=f"{older}, which is of another layout", wanted="a folder for this layout only"
+                "output",
+                got=f"{older}, which belongs to another layout",
+                wanted="a folder for this layout only",
             )
 
 

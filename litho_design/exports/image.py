@@ -58,7 +58,7 @@ def measured_greys(file: str | Path) -> Callable[[LayoutSettings, int], list[int
         found = np.rint(np.interp(heights, height_um, grey)).astype(int)
         if heights[-1] > height_um[-1] + 1e-9 or len(set(found.tolist())) < layout.levels:
             got = f"{np.ptp(height_um):.3g} µm for levels up to {heights[-1] - heights[0]:.3g} µm"
-            raise InputError("dose curve", got=got, wanted="a grey of its own for every level")
+            raise InputError("dose curve", got=got, wanted="a different grey for every level")
         if found[0] < 0 or found[-1] >= 2**bits:
             raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
         return [int(one) for one in found]

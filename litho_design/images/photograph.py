@@ -291,10 +291,10 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
     """A photograph divided by the brightness of uniform light, whose mean is 1; its dark level stays."""
     from scipy.ndimage import gaussian_filter
 
-    flat = read_grey(flat_file, "photograph of an even light")[0].astype(np.float32)
+    flat = read_grey(flat_file, "photograph of uniform light")[0].astype(np.float32)
     if flat.shape != photo.shape or dark_level is None or not np.median(flat) > dark_level:
         wanted = f"{photo.shape} px, and --camera-dark-level"
-        raise InputError("photograph of an even light", got=f"{flat.shape} px", wanted=wanted)
+        raise InputError("photograph of uniform light", got=f"{flat.shape} px", wanted=wanted)
     light = gaussian_filter(flat - dark_level, 2.0)
     even: np.ndarray = (photo - dark_level) * (light.mean() / light.clip(min=0.05 * light.max()))
     return (even + dark_level).astype(np.float32)

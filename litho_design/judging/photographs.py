@@ -109,7 +109,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
-            got=f"a SI-PSNR that its noise and dark level leave open by {uncertainty['si_psnr_db']:.2f} dB",
+            got=f"a SI-PSNR uncertain by noise and dark level to {uncertainty['si_psnr_db']:.2f} dB",
             wanted=f"at most {_LARGEST_SD_DB} dB",
             hint="a longer exposure or the mean of several, and --camera-dark-level",
         )
@@ -201,7 +201,7 @@ def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
         if [object_name(item) for item in items].count(imaged) > 1:
             raise InputError(
                 "photographed object",
-                got=f"{imaged!r}, the name of two objects of the design",
+                got=f"{imaged!r}, which names two objects of the design",
                 wanted="the path of its picture, with a folder in front",
             )
         stack = object_stack([own[imaged]], settings.object_px, task.pictures)

@@ -160,7 +160,7 @@ class Bands:
         if self.count > 1 and (self.band_px < 2 * halo or last < halo):
             raise InputError(
                 "rows of a band",
-                got=f"{self.band_px} px, and {last} in the last, where the printer reaches {halo} px",
+                got=f"{self.band_px} px, and {last} px in the last, with a reach of the printer of {halo} px",
                 wanted=f"at least {2 * halo} and {halo} px",
                 hint="a larger --band-px",
             )

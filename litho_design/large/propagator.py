@@ -33,7 +33,7 @@ class BandedPropagator:
     Args:
         pitch_um: pixel, µm.
         optics: wavelength, distance, kind of propagation.
-        bands: of the element.
+        bands: bands of the element.
 
     Raises:
         InputError: the Rayleigh-Sommerfeld kernel is requested but aliased at this distance.

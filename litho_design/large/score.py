@@ -37,7 +37,7 @@ def judge_in_bands(
     layout, optics = record.layout, record.optics
     if record.task != "hoe" or optics.element != "thin":
         got = f"{record.task}, {optics.element}"
-        raise InputError("design to score in bands", got=got, wanted="a hologram, thin")
+        raise InputError("design to score in bands", got=got, wanted="a thin hologram")
     require_one_wave(optics, "a design to score in bands")
     level, expected, seen, target = (
         read_array(folder, name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)

@@ -138,7 +138,7 @@ def _read_all(
         pixels, record = read_object(path, size_px)
         if any(np.array_equal(pixels, other) for other in pictures.values()):
             raise InputError(
-                "objects", got=f"{path}, a picture that is already there", wanted="each picture once"
+                "objects", got=f"{path}, a picture that was given already", wanted="each picture once"
             )
         pictures[record.sha256] = pixels
         records.append(record)

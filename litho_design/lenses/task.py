@@ -238,7 +238,7 @@ def _check(settings: LensSettings) -> None:
         )
     optics = settings.optics
     if radial and (optics.incidence_x or optics.incidence_y or optics.beam_um):
-        got, wanted = "oblique incidence or a beam", "even light along the axis"
+        got, wanted = "oblique incidence or a beam", "uniform light along the axis"
         raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
     if optics.propagation == "far-field":
         raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
@@ -262,6 +262,6 @@ def _check_outermost_zone(settings: LensSettings) -> None:
         raise InputError(
             f"cells of {layout.cell_um:g} µm",
             got=f"an outermost zone of the lens of {zone_um:.3g} µm",
-            wanted="two cells a zone",
+            wanted="at least two cells per zone",
             hint=f"--distance-um {radius_um * math.sqrt(1 / sine**2 - 1):.4g} or more, or smaller cells",
         )

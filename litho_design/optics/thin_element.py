@@ -43,8 +43,8 @@ class Optics(Record):
         gt=0,
     )
 
-    incidence_x: float = setting(0.0, "Sine of the angle at which light falls in, along x", gt=-1, lt=1)
-    incidence_y: float = setting(0.0, "Sine of the angle at which light falls in, along y", gt=-1, lt=1)
+    incidence_x: float = setting(0.0, "Sine of the angle of incidence along x", gt=-1, lt=1)
+    incidence_y: float = setting(0.0, "Sine of the angle of incidence along y", gt=-1, lt=1)
     source_sine: float = setting(
         0.0,
         "Sine of half the angle under which the element sees an incoherent source; 0 for a point",
@@ -59,13 +59,13 @@ class Optics(Record):
     )
     beam_um: float = setting(
         0.0,
-        "Radius of a Gaussian beam on the element, at 1/e² of its intensity; 0 for even light",
+        "Radius of a Gaussian beam on the element, at 1/e² of its intensity; 0 for uniform light",
         unit="µm",
         ge=0,
     )
     source_distance_um: float = setting(
         0.0,
-        "Distance of the point before the element that its light comes from; 0 for far away",
+        "Distance from the element back to a point source; 0 for a far source",
         unit="µm",
         ge=0,
     )
@@ -77,12 +77,10 @@ class Optics(Record):
     )
     element: ElementKind = setting(
         "thin",
-        "Element: one phase per place (thin), or the wave propagation method through the relief (thick)",
+        "Element: one phase per pixel (thin), or the wave propagation method through the relief (thick)",
         option="--element",
     )
-    dispersion: Resin = setting(
-        "ip-dip", "Resin whose index against wavelength is used where the wavelength varies"
-    )
+    dispersion: Resin = setting("ip-dip", "Resin whose dispersion is used if the wavelength varies")
 
     def at_wavelength(self, wavelength_um: float) -> Optics:
         """The same optics at another wavelength, with the index step that the resin has there."""

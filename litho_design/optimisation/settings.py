@@ -47,14 +47,14 @@ class SearchSettings(Record):
     rate_schedule: Literal["constant", "step", "plateau"] = setting(
         "constant",
         "Learning rate over the iterations: constant; times rate_factor every rate_iterations (step); or "
-        f"after more than as many in a row whose samples have no loss lower by {PROGRESS:g} (plateau)",
+        f"times it after more than rate_iterations without a loss lower by {PROGRESS:g} (plateau)",
     )
-    rate_factor: float = setting(0.5, "Factor of the learning rate at each of these times", gt=0, lt=1)
-    rate_iterations: int = setting(25, "Iterations between these times, or without a lower loss", ge=1)
+    rate_factor: float = setting(0.5, "Factor of the learning rate at each reduction", gt=0, lt=1)
+    rate_iterations: int = setting(25, "Iterations between two reductions, or without a lower loss", ge=1)
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
-    keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
+    keep: Literal["best", "last"] = setting("best", "Evaluated layout that is kept")
     polish_rounds: int = setting(10, "Rounds of single-level changes after the search", ge=0)
     checkpoint_every: int = setting(50, "Iterations between two checkpoints", ge=1)
     precision: Literal["float32", "bfloat16"] = setting(
@@ -104,7 +104,7 @@ class DesignSettings(Record):
 
     variant: Variant = setting(
         "default",
-        "Preset: ours, as printed in the paper, or as in the authors' code",
+        "Preset: this project's, as printed in the paper, or as in the authors' code",
         option="--variant",
     )
     layout: LayoutSettings = setting(LayoutSettings(), "Layout")
@@ -112,7 +112,7 @@ class DesignSettings(Record):
     search: SearchSettings = setting(SearchSettings(), "Search")
     window: ProcessWindow = setting(ProcessWindow(), "Process window")
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
-    fabrication: Fabrication = setting(Fabrication(), "What the printer can make")
+    fabrication: Fabrication = setting(Fabrication(), "Limits of the printer")
 
     @model_validator(mode="before")
     @classmethod

@@ -21,11 +21,11 @@ class Stitching(Record):
     """
 
     field_um: float = setting(
-        100.0, "Side of the write fields that an element is printed in", unit="µm",
+        100.0, "Side of the write fields of a print", unit="µm",
         option="--stitch-field-um", gt=0,
     )  # fmt: skip
     sigma_um: float = setting(
-        0.0, "Spread of the place of write fields, along each axis", unit="µm", option="--stitch-sigma-um",
+        0.0, "Spread of the displacement of write fields, each axis", unit="µm", option="--stitch-sigma-um",
         ge=0,
     )  # fmt: skip
 

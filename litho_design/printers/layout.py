@@ -34,7 +34,7 @@ class LayoutSettings(Record):
     )
     cell_filter_um: float = setting(
         0.0,
-        "Standard deviation of a Gaussian filter over the free cells, so that neighbours follow each other; "
+        "Standard deviation of a Gaussian filter over the free cells, so that neighbours change together; "
         "0 for none",
         unit="µm",
         option="--cell-filter-um",

@@ -26,7 +26,7 @@ class ReliefSettings(DesignSettings):
         gt=0,
     )
     off_blur_um: float = setting(
-        1.0, "Blur of what a first print was off, where one was measured", unit="µm", ge=0
+        1.0, "Blur of the deviation of a first print, if one was measured", unit="µm", ge=0
     )
 
 

@@ -71,9 +71,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
             for name, by_model in design.width.figures.items()
             for model, figures in by_model.items()
         ]
-        page.table(
-            rows, "The layout and those of doing nothing, by every model at hand", "width.csv", digits=4
-        )
+        page.table(rows, "The layout and the uncorrected ones, by every model at hand", "width.csv", digits=4)
     page.heading("All scores", folded=True)
     labels = meanings(task.score_type)
     if isinstance(task, LensTask):
@@ -112,7 +110,7 @@ def _add_reference(page: Page, design: Design, task: Task) -> None:
     what = (
         f"A perfect lens of this aperture puts {100 * reference:.1f} % within the same radius"
         if lens
-        else f"A continuous phase that cares for nothing but power puts {100 * reference:.1f} % on the signal"
+        else f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal"
     )
     page.paragraph(f"{what}; the print reaches {reached:.2f} of that.")
 

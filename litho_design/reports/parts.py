@@ -128,7 +128,7 @@ def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
     columns = {"print": design.predicted} | thick | (design.baselines or {})
     page.table(
         score_table(columns, labels),
-        "Scores of the printable layout as printed, and of what it is to be compared with on the same grid",
+        "Scores of the printable layout as printed, and of its baselines on the same grid",
         "scores.csv",
         digits=4,
     )

@@ -87,8 +87,8 @@ def _make(
     if task.polished:
         level, width = best_layout(task, level)
     if width is not None and width.returned != SEARCHED:
-        what = f"the models at hand print the layout “{width.returned}” better than that of the search"
-        task.notes.append(f"{what}, so it was taken")
+        what = f"the models at hand print the layout “{width.returned}” better than the searched one"
+        task.notes.append(f"{what}, so it was chosen")
         with torch.no_grad():
             loss = float(task.objective(level[None, None].float())[0])
     height = task.printed_um(level)

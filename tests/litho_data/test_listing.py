@@ -143,7 +143,7 @@ def test_no_pair_at_all(tmp_path: Path) -> None:
 
 def test_an_expression_that_never_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listing, "_LONGEST_S", 0.5)
-    with pytest.raises(InputError, match="repetitions inside repetitions"):
+    with pytest.raises(InputError, match="nested repetitions"):
         listing.prints_of(["a" * 40], "(?P<print>(a+)+)b")
     ids = ["A1", "B22", "c3", "ÄÖ4"]
     expected = ["A", "B", None, None]

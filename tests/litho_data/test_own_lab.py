@@ -60,7 +60,7 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
     assert f"check {MIRRORED}: a mirror image" in build.stderr
     # Level 0 of these prints stands two levels above the substrate.
-    assert "check all scans: their outermost pixels lie" in build.stderr
+    assert "check all scans: their outermost pixels deviate" in build.stderr
     scan = store.scan("B3")
     assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
     # Around it models see the substrate, and its measured heights stand where the scan has them.

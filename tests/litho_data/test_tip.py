@@ -258,7 +258,7 @@ def test_the_command_prints_the_tip_and_writes_its_maps(tmp_path) -> None:
     assert (tmp_path / "maps" / "print.surface.gsf").exists()
     twice = CliRunner().invoke(app, ["tip", str(file), str(file), "--maps", str(tmp_path / "maps")])
     assert isinstance(twice.exception, InputError)
-    assert "names that differ" in str(twice.exception)
+    assert "different names" in str(twice.exception)
     said = json.loads(CliRunner().invoke(app, ["tip", str(file), "--json"]).stdout)
     assert said["kind"] == "estimate"
     assert said["scans"][0]["certain_fraction"] == pytest.approx(certain.mean(), abs=0.01)

@@ -58,7 +58,7 @@ def test_verify_answers_for_a_store_that_has_lost_a_part(own_campaign: Path, los
     else:
         part.unlink()
     found = [str(finding) for finding in verify(own_campaign / "prints.zarr").findings]
-    assert any(f"file {lost}" in one and "is not there" in one for one in found)
+    assert any(f"file {lost}" in one and "but missing" in one for one in found)
 
 
 def test_a_packed_store_that_has_lost_a_file_is_refused(own_campaign: Path, tmp_path: Path) -> None:

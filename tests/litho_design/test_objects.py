@@ -204,7 +204,7 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
         (("--objects", "pictures/a.png"), "got 0 for the design"),
         (("--objects", "pictures/a.png", "--objects", "pictures/b.png"), "0 for the design and 2 held out"),
         (("--objects", "pictures", "--held-out-objects", "extra.png"), "1 held out"),
-        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "already there"),
+        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "given already"),
         (("--objects", "black.png"), "without any light"),
         (("--objects", "pictures", "--task", "direct"), "images no objects"),
         (("--objects", "pictures", "compare"), "the hoe task"),

@@ -120,5 +120,5 @@ def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient
 
 def test_a_filter_needs_neighbours():
     layout = SQUARE.model_copy(update={"cell_filter_um": 0.4})
-    with pytest.raises(InputError, match="no neighbours"):
+    with pytest.raises(InputError, match="cannot be filtered"):
         make_parametrisation(layout, SearchSettings(parametrisation="gumbel"))
