@@ -26,7 +26,7 @@ from litho_models.boards.figures import figure_lines, make_scoreboard, trial_tab
 from litho_models.boards.records import Board
 
 # Announced before any of their trials is run; development uses other seeds.
-ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20271}
+ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20272}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
@@ -104,7 +104,7 @@ def _arguments() -> argparse.Namespace:
     add("--scans", type=int, default=12, help="scans per trial (default 12)")
     add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
     add("--workers", type=int, default=1, help="trials side by side, one thread each")
-    add("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
+    add("--dask", help="address of a Dask scheduler; its workers replace --workers")
     add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
     add("--timeout-s", type=float, default=3600.0, help="longest time of a trial, seconds")
     add("--keep-data", action="store_true", help="keep raw files and stores")

@@ -127,7 +127,7 @@ def freed_by_policy(
     """Each scan freed of the terms of each policy; ``maps_um``: (ny, nx) µm, expected of it."""
     return {
         policy: [
-            cross_fit(scan.height_um, expected, scan.valid, POLICIES[policy], blocks)
+            cross_fit(scan.height_um, expected, scan.usable, POLICIES[policy], blocks)
             for scan, expected in zip(scans, maps_um, strict=True)
         ]
         for policy in policies
