@@ -71,7 +71,7 @@ def test_defaults_are_those_of_the_contract() -> None:
         ("source", {"url": "file:///x", "registry": "a"}, r"source\.url"),
         ("name", "../x", r"name"),
         ("name", "x" * 201, r"name"),
-        ("scan.files", "a\0{id}", r"scan\.files.*can be read"),
+        ("scan.files", "a\0{id}", r"scan\.files.*printable"),
         ("scan.unit", "m" * 5000, r"scan\.unit = 'm{79}…: "),
         ("grating", {"period_um": 2.0, "uncertainty_um": 1e308}, r"grating\.uncertainty_um"),
         ("grating", {"period_um": 2.0, "uncertainty_um": True}, r"grating\.uncertainty_um"),

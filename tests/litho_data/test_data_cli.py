@@ -41,8 +41,8 @@ def test_a_recipe_is_suggested_for_the_card_in_a_folder_beside_the_store(
     folder = tmp_path / "a-levelling"
     assert asked == [(Path("card.toml"), folder, tmp_path)]
     assert said == [
-        "plane: the layout leaves P11 1.2 nm",
-        "lines: the layout leaves P11 4.0 nm (moves lines)",
+        "plane: not explained by the layout: P11 1.2 nm",
+        "lines: not explained by the layout: P11 4.0 nm (moves lines)",
         "suggested: plane; build new.toml",
         f"pictures {folder / 'report.html'}",
     ]

@@ -242,7 +242,7 @@ def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:
     path = tmp_path / "scan.npy"
     height_um = np.random.default_rng(0).random((40, 50))
     np.save(path, np.minimum(height_um, 0.97))
-    assert "its highest value stands in many pixels (0.97 in " in read_scan(path, unit="um").notes[0]
+    assert "its highest value occurs in many pixels (0.97 in " in read_scan(path, unit="um").notes[0]
     np.save(path, height_um)
     assert read_scan(path, unit="um").notes == ()
 

@@ -470,6 +470,6 @@ def test_a_training_that_diverges_is_told_in_one_line(name, rate, tmp_path):
         recipe="paper", variant="paper" if name != "physics" else "default", learning_rate=rate,
         steps=4, rounds=1, batch=1, crop_px=32, nuisance="offset", validation_scans=0,
     )  # fmt: skip
-    with pytest.raises(InputError, match=rf"^training of {name}, got .* no numbers .*smaller learning_rate$"):
+    with pytest.raises(InputError, match=rf"^training of {name}, got .* not finite .*smaller learning_rate$"):
         fit_with_record(name, make_scans(2, size_px=64), config, checkpoint=tmp_path / "kept")
     assert not list(tmp_path.iterdir())
