@@ -66,7 +66,7 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         raise InputError(f"{what}: cells", got="more cells than columns")
     scan_id = row.get("id", "")
     if not SAFE_ID.fullmatch(scan_id):
-        raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id in the data folder, without path")
+        raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id without a path")
     order = row.get("order", "")
     if needs_order and not (order.lstrip("-").isdecimal() and ORDER.holds(order)):
         raise InputError(f"{what}: order", got=repr(row.get("order", "")), wanted="a whole number")

@@ -184,9 +184,11 @@ def _not_allowed(error: Exception) -> InputError | None:
     if "Symlink loop" in text:
         return InputError("a link that leads to itself", got=text.partition("'")[2].rstrip("'"))
     if isinstance(error, RecursionError):
-        return InputError("input", got="parts nested too deep", wanted="a flatter file")
+        return InputError(
+            "input", got="parts nested too deeply", wanted="a file with fewer levels of nesting"
+        )
     if isinstance(error, OverflowError):
-        return InputError("number in the input", got=error, wanted="a number of a possible size")
+        return InputError("number in the input", got=error, wanted="a number within the supported range")
     return None
 
 

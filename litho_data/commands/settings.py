@@ -189,7 +189,7 @@ def read_settings(path: str | Path) -> dict[str, Any]:
     file = Path(path)
     read = {".toml": tomllib.loads, ".json": json.loads}.get(file.suffix.lower())
     if read is None:
-        raise InputError("settings file", got=str(file), wanted="a file .toml or .json")
+        raise InputError("settings file", got=str(file), wanted="a .toml or .json file")
     content = parsed(file, read, f"settings file {file}", file.suffix[1:].upper())
     if not isinstance(content, dict):
         raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")

@@ -94,7 +94,7 @@ def suggest_recipe(
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
-        raise InputError("recipes to compare", got="micrographs", wanted="scans of heights")
+        raise InputError("scans for comparing recipes", got="micrographs", wanted="scans of heights")
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
     # Three scans far apart in the list; others if one of them cannot be used.
     places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()

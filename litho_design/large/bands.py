@@ -124,7 +124,7 @@ class Bands:
         if self.count < self.ranks.count:
             raise InputError(
                 "processes",
-                got=f"{self.ranks.count} for {self.count} bands of {self.band_px} of {self.size_px} rows",
+                got=f"{self.ranks.count} for {self.count} bands ({self.size_px} rows, {self.band_px} a band)",
                 wanted="at most one per band",
                 hint="fewer processes, or a smaller --band-px",
             )

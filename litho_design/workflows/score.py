@@ -62,7 +62,7 @@ def score(
     in_parts = band_px is not None or record.in_rings
     if in_parts and any(one is not None for one in (loaded, scan, camera, element)):
         given = "a scan, a photograph, another element or a design in memory"
-        raise InputError("score of a large element", got=given, wanted="models as judges")
+        raise InputError("score of a large element", got=given, wanted="models that score it")
     if record.in_rings and (stitch is not None or band_px is not None):
         raise InputError("score of a lens in rings", got="write fields or bands", wanted="neither")
     if loaded is None and not in_parts:

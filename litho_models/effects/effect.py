@@ -150,7 +150,9 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The formula of an effect that has none: each scan has its own, which its scan terms fit."""
-    raise InputError("an effect in a model", got="one of single scans", wanted="one value for all scans")
+    raise InputError(
+        "an effect in a model", got="one with a value for each scan", wanted="one with a value for all scans"
+    )
 
 
 @dataclass(frozen=True)

@@ -199,6 +199,6 @@ def _check_effects(card: ModelCard) -> None:
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",
                 wanted="an effect of the printer",
-                hint="`litho-models freeze --attribute printer` takes in an undetermined one",
+                hint="`litho-models freeze --attribute printer` makes an undetermined effect one",
             )
         effect.require_in_range(values)

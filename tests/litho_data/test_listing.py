@@ -86,7 +86,7 @@ def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_pat
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ("id,order\n../P11,1\n", r"line 2: id, got '\.\./P11'.*without path"),
+        ("id,order\n../P11,1\n", r"line 2: id, got '\.\./P11'.*without a path"),
         ("id,order\nP11,1\nP11,2\n", "each id once"),
         ("id,order\nP11,first\n", "whole number"),
         ("id,dose\nP11,high\n", "dose.*a number"),

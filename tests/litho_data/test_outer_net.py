@@ -46,7 +46,7 @@ OUTSIDE: dict[str, tuple[Exception, str]] = {
     ),
     "no memory on a GPU": (CannotAllocate("CUDA out of memory. Tried"), "not enough memory"),
     "a link to itself": (RuntimeError("Symlink loop from '/a/b'"), "leads to itself, got /a/b"),
-    "too deep": (RecursionError("maximum recursion depth"), "parts nested too deep"),
+    "too deep": (RecursionError("maximum recursion depth"), "parts nested too deeply"),
     "too large": (OverflowError("int too large to convert to float"), "int too large"),
     "bad input": (InputError("x", got=1, wanted=2), "x, got 1, wanted 2"),
 }
