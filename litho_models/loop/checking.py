@@ -162,13 +162,10 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
     """A change of the prediction (y, x), µm, and the same in other shapes."""
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
-
-    def blurred(field: np.ndarray, sigma_um: float) -> np.ndarray:
-        return gaussian_filter(field, sigma_um / pitch)
-
-    near, far = blurred(layout, 0.6), blurred(layout, 2.0)
+    # Widths in pixels: small beside what the process resolves, on films of nanometres too.
+    near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
-    soft = [blurred(change, sigma_um) for sigma_um in (0.2, 0.6, 1.6)]
+    soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]
     y, x = (np.linspace(-1, 1, size) for size in change.shape)
     place = y[:, None], x, y[:, None] ** 2 + x**2
     factors = (1.0, relative, relative**2, np.abs(change), near, far, near - layout, *place)

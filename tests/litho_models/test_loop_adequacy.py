@@ -47,6 +47,20 @@ def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
     assert share("slope-thinning", "slope-thinning", beside=("write-order-memory",)) < FORM_SHARE
 
 
+def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() -> None:
+    """On a film of nanometres they are what they are on a print of micrometres; slopes are per length."""
+    rng = np.random.default_rng(0)
+    change, prediction, layout = rng.random((3, 48, 40))
+
+    def shapes(pitch_um: float) -> list[np.ndarray]:
+        stored, context = SimpleNamespace(layout_um=layout), SimpleNamespace(pitch_um=pitch_um)
+        return checking._shapes(change, prediction, SimpleNamespace(stored=stored, context=context))
+
+    coarse, fine = shapes(0.1), shapes(0.004)
+    assert all(np.allclose(a, b) for a, b in zip(coarse[:-4], fine[:-4], strict=True))
+    assert all(np.allclose(0.1 * a, 0.004 * b) for a, b in zip(coarse[-4:], fine[-4:], strict=True))
+
+
 @pytest.mark.parametrize(
     ("reshaped_nm2", "left_nm2", "exhausted", "said"),
     [
