@@ -126,7 +126,7 @@ def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
 
 
 def _attributes(store: Store) -> Iterator[Finding]:
-    """Compare the attributes of the root with those that follow from the manifest and the arrays."""
+    """Compare the root's attributes with those computed from the manifest and the arrays."""
     attributes = dict(store.root.attrs)
     sha256 = attributes.get("dataset_sha256")
     try:

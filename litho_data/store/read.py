@@ -135,7 +135,7 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """Named groups of the card's pattern in an id, except for the print.
+        """The groups that the card's pattern for ids names, with their values in one id; without the print.
 
         A pattern with repetitions is not applied, because one in a store from elsewhere might never finish.
         """

@@ -104,7 +104,7 @@ def write_samples(
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "units": "um"}
         centres = pixel_centres_um(count, pitch_um)
         write_numbers(root, f"{axis}_um", centres, axis, attributes=described)
-        # By the CF conventions, one coordinate of an array names the axis.
+        # The CF conventions allow only one coordinate of an array to name an axis.
         write_numbers(root, axis, centres, axis, attributes={**described, "axis": axis.upper()})
 
 

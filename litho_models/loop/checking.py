@@ -31,7 +31,7 @@ FORM_SHARE = 0.15
 
 @dataclass(frozen=True)
 class Check:
-    """What the causes of a model are checked by.
+    """What the causes of a model are checked against.
 
     Attributes:
         state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all that might stand in a
@@ -58,7 +58,7 @@ class Check:
         return self.state.study
 
     def of(self, cause: Cause) -> Cause:
-        """One of the causes, judged with everything else in place."""
+        """One of the causes, judged with everything else in the model."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
         reshaped_nm2 = reshaped_gain(without, self.state)
@@ -96,7 +96,7 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """A cause that stands otherwise, held against laws: its name falls if short ones do better.
+        """Compare a cause that passed all other checks with laws: it loses its name if short laws fit better.
 
         Two laws at most, with no more numbers than the cause has.
         """
@@ -112,9 +112,10 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """A cause that stands otherwise, held against a table that takes over twice as much in its place.
+        """Compare a cause that passed all other checks with the best table in its place.
 
-        Where such a table leaves nothing to the cause, it is a part of something larger without a name.
+        If the table gains over twice as much, and the cause gains nothing beside it, the cause is only a part
+        of something larger that has no name.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -126,7 +127,7 @@ class Check:
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """The law that promises most, if that is a fair part of what this model lacks beside the cause."""
+        """The law that promises the largest gain, if it is a fair part of what the cause gains."""
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (

@@ -104,7 +104,7 @@ class Screening:
 
     @cached_property
     def candidates(self) -> dict[str, dict[str, Screened]]:
-        """Of each effect, by grouping, the best trial."""
+        """The best trial of each effect in each grouping."""
         found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
@@ -127,7 +127,7 @@ class Screening:
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """The candidates that stand out, each with the grouping that its scans ask for, by gain."""
+        """The candidates that stand out, each with its best grouping, the largest gain first."""
         standing = []
         for own in self.candidates.values():
             grouped = self._grouped(own)
@@ -140,7 +140,7 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """The grouping of a strength that gains beyond chance over one strength for all, or None."""
+        """The best grouping, if it gains more than chance over one strength for all scans, or None."""
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
         best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})

@@ -21,7 +21,8 @@ from litho_data.foundation.errors import InputError
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
-# Points per side of a frequency's cell, to count its share of the source; odd, so that one is the centre.
+# Sample points along each side of a frequency cell, which measure the share of it that the source fills. The
+# number is odd, so that one point is the centre.
 _COUNTED = 9
 
 

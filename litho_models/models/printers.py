@@ -15,7 +15,7 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 class PrinterConfig(SimulatorConfig):
     """The parts in order, and the values (fixed or initial) of their numbers, by ``part.number``.
 
-    A number may be set like a field of its own: ``spot.sigma_um``.
+    Each number can also be set as if it were a field: ``spot.sigma_um``.
     """
 
     parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names in order of action")
