@@ -88,11 +88,9 @@ class Recipe(BaseModel):
             InputError: a step that lacks what it needs, or data that it cannot be applied to.
         """
         if isinstance(scan, Scan):
-            heights, pitch_um = scan.height_um, scan.pitch_um
             mask = scan.mask if mask is None else mask
-        else:
-            heights = scan
-        state = State(as_height(heights), mask, pitch_um, layout_level)
+            scan, pitch_um = scan.height_um, scan.pitch_um
+        state = State(as_height(scan), mask, pitch_um, layout_level)
         start = state.height_um
         for number, step in enumerate(self.step, start=1):
             with about(f"recipe step {number} ({step.op})"):
