@@ -71,7 +71,7 @@ def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
 
     def made(function: Callable[..., R]) -> Callable[..., R]:
         _, _, *parameters = inspect.signature(function, eval_str=True).parameters.values()
-        fields: dict[str, Any] = {
+        fields: dict[str, Any] = {"op": (Literal[op], op)} | {
             one.name: (one.annotation, ... if one.default is one.empty else one.default) for one in parameters
         }
         of_scan = {name: fields.pop(name)[1] is None for name in _OF_SCAN if name in fields}
@@ -82,7 +82,7 @@ def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
             arguments |= {"masking": masking} if knows_masking else {}
             return function(z, select(z, mask, masking), **arguments)
 
-        step = create_model(op, __base__=Step, op=(Literal[op], op), **fields)
+        step = create_model(op, __base__=Step, **fields)
         step.function, step.of_scan = staticmethod(run), of_scan
         STEPS[op] = step
 

@@ -88,9 +88,10 @@ class Recipe(BaseModel):
             InputError: a step that lacks what it needs, or data that it cannot be applied to.
         """
         if isinstance(scan, Scan):
-            mask = scan.mask if mask is None else mask
-            scan, pitch_um = scan.height_um, scan.pitch_um
-        state = State(as_height(scan), mask, pitch_um, layout_level)
+            heights, mask, pitch_um = scan.height_um, scan.mask if mask is None else mask, scan.pitch_um
+        else:
+            heights = scan
+        state = State(as_height(heights), mask, pitch_um, layout_level)
         start = state.height_um
         for number, step in enumerate(self.step, start=1):
             with about(f"recipe step {number} ({step.op})"):

@@ -184,8 +184,10 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
         for group, members in groups.items()
         if isinstance(group, float) and np.median(growth[members]) > 0
     }
-    traded: Mapping[float | str, str] = {**_traded_doses(rising, scatter)}
-    yield from ((one.id, traded[one.group]) for one in prints if one.group in traded)
+    traded = _traded_doses(rising, scatter)
+    yield from (
+        (one.id, traded[one.group]) for one in prints if isinstance(one.group, float) and one.group in traded
+    )
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:

@@ -68,7 +68,8 @@ class Bend:
 
         Outside the frame it is that of the nearest point of the frame.
         """
-        terms = _terms(*(np.clip(one, -1, 1) for one in self.unit(x, y)), self.degree)
+        u, v = (np.clip(one, -1, 1) for one in self.unit(x, y))
+        terms = _terms(u, v, self.degree)
         along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 

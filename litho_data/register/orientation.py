@@ -118,7 +118,8 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     """
     from scipy.fft import irfft2, next_fast_len
 
-    shape = [next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True)]
+    ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
+    shape = (ny, nx)
     (mask1, height1, square1), (mask2, height2, square2) = (_spectra(one, shape) for one in (fixed, moving))
 
     def summed(one: Array, other: Array) -> Array:
