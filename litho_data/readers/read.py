@@ -63,8 +63,8 @@ def read_scan(
 
     Raises:
         InputError: an unreadable file, no or several height channels, a missing or contradicting unit or
-            size, a value that looks like an unnamed mark of missing pixels, heights that cannot be, or no finite
-            value.
+            size, a value that looks like an unnamed mark of missing pixels, heights that cannot be, or no
+            finite value.
     """
     with unpacked(require_file(path)) as file:
         reader = _settle_format(file, format)
