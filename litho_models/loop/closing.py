@@ -170,8 +170,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
-        # Two terms at most, so that a law is a short formula.
-        lawful = search(named.state, laws, 2, secants)
+        lawful = search(named.state, laws, 4, secants)
         study.report("describing what is left")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
