@@ -8,6 +8,7 @@ nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ from litho_models.effects.filters import add_blur, add_filtered, gradient, round
 
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _RIM_UM = 2.0
+# So near to each other that over a micrometre none of them is out of step with a wave between them.
+_FREQUENCIES_PER_UM = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 9.5, 10.0)
 _WORDS = ("x", "y", "r²", "rim")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
@@ -217,6 +220,24 @@ def _law(name: str, formula: str, unit: str, column: Column, **shapes: Parameter
     )
 
 
+@of_development(
+    "height changed by a wave of the height itself, sin(2π f h + phase)",
+    {
+        "sine_um": Parameter("µm", -0.2, 0.2, 0.02),
+        "cosine_um": Parameter("µm", -0.2, 0.2, 0.02),
+        "frequency_per_um": Parameter("1/µm", 2.0, 10.0, 5.0, "shape", tried=_FREQUENCIES_PER_UM),
+    },
+    role="undetermined",
+    source="found in the residual; h in µm",
+    separating="print a staircase of small steps",
+    knowledge="law",
+)
+def height_wave(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """As slices or standing waves leave it."""
+    phase = 2 * math.pi * values["frequency_per_um"] * height
+    return height + values["sine_um"] * phase.sin() + values["cosine_um"] * phase.cos()
+
+
 def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Effect]:
     return of_development(
         title,
@@ -261,5 +282,5 @@ def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
 
 _POSITION = Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
 _OF_JUMPS = [_law(*facts, position=_POSITION) for axis in ("x", "y") for facts in _jumps(axis)]
-LAWS = {law.name: law for law in (*(_law(*facts) for facts in _columns()), *_OF_JUMPS)}
+LAWS = {law.name: law for law in (*(_law(*facts) for facts in _columns()), *_OF_JUMPS, height_wave)}
 TABLES = {one.name: one for one in (level_table, linear_response, place_map)}

@@ -186,8 +186,8 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)
     along_x, along_y = turn.cos() * x + turn.sin() * y, turn.cos() * y - turn.sin() * x
-    whole = values["along_x_um"] + values["along_y_um"]
-    share_x, share_y = (
-        (values[axis] / whole.clamp(min=1e-12)) ** (2 / power) for axis in ("along_x_um", "along_y_um")
-    )
+    # A fit may come below zero by a rounding, which has no power.
+    loss_x, loss_y = values["along_x_um"].clamp(min=0), values["along_y_um"].clamp(min=0)
+    whole = loss_x + loss_y
+    share_x, share_y = ((one / whole.clamp(min=1e-12)) ** (2 / power) for one in (loss_x, loss_y))
     return height - whole * rounded_power(share_x * along_x**2 + share_y * along_y**2, power)

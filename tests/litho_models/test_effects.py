@@ -299,6 +299,21 @@ def test_slope_thinning_and_tip_dilation_on_a_ramp() -> None:
     assert torch.allclose((dilated - ramp)[touched], torch.tensor(0.2 * 0.25 / 2, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0])
+def test_equal_losses_along_both_axes_are_a_loss_by_the_size_of_the_slope(degrees: float) -> None:
+    """A ramp of slope 0.5 loses c 0.5^p, whichever way it faces; a loss a rounding below zero is none."""
+    y, x = torch.meshgrid(*(torch.arange(40, dtype=torch.float64) * PITCH_UM,) * 2, indexing="ij")
+    ramp = 0.5 * (math.cos(math.radians(degrees)) * x + math.sin(math.radians(degrees)) * y)[None, None]
+    context, inner = FieldContext(ramp, PITCH_UM, 1.2), (..., slice(1, -1), slice(1, -1))
+    for power, turn in ((1.0, 0.0), (3.0, 0.0), (3.0, 30.0)):
+        values = {"along_x_um": 0.2, "along_y_um": 0.2, "exponent": power, "turn_deg": turn}
+        change = (get_effect("slope-thinning")(ramp, values, context) - ramp)[inner]
+        # The power is rounded off at slopes of a thousandth.
+        assert torch.allclose(change, torch.tensor(-0.2 * 0.5**power, dtype=torch.float64), rtol=5e-3)
+    values = {"along_x_um": -1e-9, "along_y_um": 0.0, "exponent": 1.0, "turn_deg": 0.0}
+    assert torch.equal(get_effect("slope-thinning")(ramp, values, context), ramp)
+
+
 def test_an_asymmetric_tip_rests_on_a_slope_by_its_radius_along_it() -> None:
     y, x = torch.meshgrid(*(torch.arange(40, dtype=torch.float64) * PITCH_UM,) * 2, indexing="ij")
     slope = (0.3 * y + 0.5 * x)[None, None]

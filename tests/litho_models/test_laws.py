@@ -147,11 +147,11 @@ FORMULAS = formulas()
 
 
 def test_every_law_has_a_formula_here() -> None:
-    assert set(FORMULAS) == set(LAWS)
+    assert {*FORMULAS, "height-wave"} == set(LAWS)
     assert len({law.title for law in LAWS.values()}) == len(LAWS)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", FORMULAS)
 def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
     wanted = FORMULAS[name](HEIGHT)
     assert wanted.std() > 1e-3
@@ -163,6 +163,12 @@ def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
         allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
     found = changed(name, {"strength": 0.05}, HEIGHT)
     np.testing.assert_allclose(found, 0.05 * wanted, atol=0.05 * allowed, rtol=1e-9)
+
+
+def test_a_wave_of_the_height_has_its_size_phase_and_period() -> None:
+    wave = {"sine_um": 0.03, "cosine_um": 0.04, "frequency_per_um": 3.0}
+    wanted = 0.05 * np.sin(2 * np.pi * 3 * HEIGHT + np.arctan2(0.04, 0.03))
+    np.testing.assert_allclose(changed("height-wave", wave, HEIGHT), wanted, atol=1e-9)
 
 
 @BY_NAME
@@ -186,7 +192,7 @@ def test_a_flat_print_has_a_finite_derivative(name: str) -> None:
 POWERS_OF_UM = {"1": 0, "µm": 1, "µm²": 2, "1/µm": -1, "1/µm²": -2}
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if not name.endswith(("-um", "-rim"))])
+@pytest.mark.parametrize("name", [name for name in FORMULAS if not name.endswith(("-um", "-rim"))])
 def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
     """In units half as large all lengths are twice as many, the change of the height too."""
     unit = LAWS[name].parameters["strength"].unit
