@@ -57,9 +57,9 @@ def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> t
     Args:
         values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
     """
-    names = list(dict.fromkeys(groups))
-    member = np.array([names.index(group) for group in groups], np.intp)[owner]
-    sums, counts = np.bincount(member, values), np.bincount(member)
+    sums, counts = (
+        _by_group(np.bincount(owner, own, minlength=len(groups)), groups)[0] for own in (values, None)
+    )
     seen = counts > 0
     if seen.sum() < FEWEST_FOR_INTERVAL:
         return None
