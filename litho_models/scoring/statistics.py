@@ -73,7 +73,7 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
     return float(low), float(high)
 
 
-def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
+def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
     """Sum and count of the values of each group; each value by itself without groups."""
     sample = np.asarray(values, np.float64)
     if groups is None:
