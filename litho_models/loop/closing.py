@@ -1,7 +1,7 @@
-"""Close the loop on a set of scans: from the residual of a base to causes, laws and what is left.
+"""Close the loop on a set of scans: find causes and laws in the residual of a base.
 
-``close`` is an estimator: it chooses and fits on the scans that it is given, and what it returns predicts any
-other scan. Whatever is judged on scans is chosen without them by calling it on the rest.
+``close`` is an estimator. It chooses and fits on the given scans, and its result predicts any other scan. To
+judge the choices on some scans, call it on the others.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from litho_models.scan_terms.grouped import ALL
 
 @dataclass(frozen=True)
 class Closed:
-    """What was chosen and fitted on some scans.
+    """The choices and fits made on some scans.
 
     Attributes:
-        base_name: of the base with the smallest error; ``others``: those that lost against it.
-        plain: the base fitted to the scans as they are; ``base``: to scans freed of what a group shares.
-        named: among causes; ``lawful``: among short laws beside them.
-        described: tables over a covariate, which say where the rest lies; the model has them last.
-        rests: what features of layout and place still explain, by stage.
-        untestable: effects that could not be tested, with the reason.
+        base_name: name of the base with the smallest error; ``others``: the other bases.
+        plain: the base fitted to the original scans; ``base``: the base fitted to the freed scans.
+        named: result of the search among causes; ``lawful``: of the search for short laws beside them.
+        described: tables over a covariate, which describe the remaining error; they act last in the model.
+        rests: what features of layout and position still explain after each stage.
+        untestable: effects that could not be tested, with reasons.
     """
 
     base_name: str
@@ -51,17 +51,17 @@ class Closed:
 
     @property
     def given(self) -> Study:
-        """The scans as they are."""
+        """The original scans."""
         return self.plain.study
 
     @property
     def study(self) -> Study:
-        """The freed scans."""
+        """The scans without what groups of them share."""
         return self.base.study
 
     @property
     def final(self) -> State:
-        """The corrected model: causes, laws, and tables where neither holds."""
+        """The corrected model, with causes, laws and tables."""
         return self.described.state
 
     @property
@@ -71,17 +71,17 @@ class Closed:
 
     @property
     def found(self) -> list[Cause]:
-        """All that is reported."""
+        """All findings that are reported."""
         return [*self.traced, *self.described.causes]
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find what a base lacks on these scans.
+    """Find what a base model lacks on these scans.
 
     Args:
         study: development scans.
-        bases: simulators by name, those with few parameters refitted, others taken as they are: the one with
-            the smallest error on held-out scans is corrected.
+        bases: simulators by name. Those with few parameters are refitted. The one with the smallest error on
+            held-out scans is corrected.
     """
     fits = {}
     for name, base in bases.items():
@@ -89,7 +89,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         fits[name] = fit_state(Twin.bare(base), study)
     best = min(fits, key=lambda name: fits[name].mse_nm2)
     plain = fits[best]
-    study.report("learning what scans of a group share")
+    study.report("learning what groups of scans share")
     freed = replace(study, scans=prepare_scans(freed_scans(plain)))
     start = fit_state(plain.twin, freed)
     learner = Learner(freed, start.maps_um(freed.scans))
@@ -109,7 +109,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
     ):  # fmt: skip
-        # By the model, so that a stage that changes nothing counts with the one before it.
+        # Stages are told apart by their model: one that changes nothing equals the stage before it.
         stages.setdefault(state, name)
     return Closed(
         base_name=best,
@@ -127,19 +127,19 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def _searched(
     start: State, candidates: Sequence[Effect], rest: Callable[[State], Rest]
 ) -> tuple[Found, Found, Found]:
-    """Causes, laws beside them, and tables beside both; each cause is checked with everything else in place.
+    """Search for causes, then laws, then tables, and check each cause beside everything else.
 
-    One that fails is taken out, and laws are sought anew without it.
+    A cause that fails is removed, and the search for laws is repeated without it.
     """
     study, named = start.study, search(start, candidates)
-    # Laws and tables are of heights.
+    # Laws and tables describe heights, not films.
     laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
-        study.report("looking for a law in what is left")
-        # Two terms at most, so that a law is a short formula.
+        study.report("searching the residual for laws")
+        # At most two terms keep a law short.
         lawful = search(named.state, laws, 2, secants)
-        study.report("describing what is left")
+        study.report("describing the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
             in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
@@ -151,7 +151,8 @@ def _searched(
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return named, lawful, _in_model(lawful.state, described)
-        # What may only correct another formula goes first: that formula is then judged without it.
+        # Causes that may only correct another formula are removed first, so that formula is judged without
+        # them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -161,7 +162,7 @@ def _searched(
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """The model with every table that is confirmed there too, fitted beside all the rest."""
+    """Add to the model every table that is still confirmed when fitted with all other parts."""
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
@@ -173,9 +174,9 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """The model, with the largest table beside it if that takes more than all causes together.
+    """Add the largest table to the model if it gains more than all causes together.
 
-    A table follows whatever it can. It is held against all causes, not against single ones.
+    A table fits almost anything, so it is compared with all causes together, not with single ones.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:
