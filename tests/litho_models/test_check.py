@@ -306,7 +306,6 @@ def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
         ("same", {"reference": "made", "new": ["12"]}, "got a store and --new, wanted one of the two"),
         ("same", {"new": ["99"]}, "--new, got 99, wanted a print of"),
         ("made", {}, "got the prints that the model was made of, wanted new ones; --reference"),
-        ("same", {"residuals": ["made"]}, "--residuals, got no reference prints"),
         ("same", {"false_alarms": 0.0}, "rate of false alarms, got 0.0"),
         ("same", {"tolerance": 5.0}, "0.05 is 5 %"),
         ("pitch", {}, "pitch_um for model affine, got 0.2 µm, wanted 0.1 µm"),

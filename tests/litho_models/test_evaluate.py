@@ -35,7 +35,7 @@ def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_pat
     assert set(run.training_ids) & set(scored.split.scored_ids)
     assert scored.trained_on_scored_scans == (sorted(run.training_ids) if same else [])
     assert ("not a held-out error" in (tmp_path / "out" / "report.html").read_text()) == same
-    assert read_residuals(open_store(store), [folder / "model"]).held_out == (not same)
+    assert read_residuals(open_store(store), folder / "model").held_out == (not same)
 
 
 def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):
