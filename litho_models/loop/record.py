@@ -99,7 +99,7 @@ class FoundEffect(Record):
         left_out_nm: increase of the mean absolute error without it (k = 1).
         family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
         reshaped_share: further gain by variants of its change, as a share of its own gain.
-        survives_on: other bases on which it is also confirmed.
+        survives_on: other bases beside which the search also found it.
     """
 
     name: str

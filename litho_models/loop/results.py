@@ -41,7 +41,6 @@ def record(
     *,
     single_scans: list[ScanFinding],
     left_out_nm: Mapping[str, float],
-    survives_on: Mapping[str, list[str]],
     **given: Any,
 ) -> CloseLoop:
     """Make the record of one run.
@@ -49,10 +48,10 @@ def record(
     Args:
         closed: result of ``close``; ``errors``: rows of ``error_rows``; ``single_scans``: findings in single
             scans.
-        left_out_nm, survives_on: by effect, see ``FoundEffect``; ``given``: further fields of the record.
+        left_out_nm: by effect, see ``FoundEffect``; ``given``: further fields of the record.
     """
     study, final = closed.study, closed.final.twin
-    effects = [_found(closed, one, left_out_nm[one.name], survives_on[one.name]) for one in closed.found]
+    effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
     before, after = (
         next(row.leading_by_scan_nm for row in errors if row.is_headline and row.model == model)
         for model in ("base", "all")
@@ -114,12 +113,12 @@ def _values(twin: Twin) -> dict[str, float]:
     return found
 
 
-def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[str]) -> FoundEffect:
+def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
-    # A cause that no other base needs may only correct this base.
-    corrects = effect.knowledge == "cause" and not {*closed.others} <= {*survives_on}
+    # A cause that another base does not need may only correct this base.
+    corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
         name=cause.name,
@@ -140,7 +139,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[s
         group_p=cause.group_p,
         reshaped_share=cause.reshaped_share,
         left_out_nm=left_out_nm,
-        survives_on=survives_on,
+        survives_on=closed.survives_on(cause),
     )
 
 
