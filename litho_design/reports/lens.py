@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 
@@ -10,6 +12,9 @@ from litho_data.reports.pictures import new_figure
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.score import mtf
 from litho_design.tasks.design import Design
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def decibels(psf: np.ndarray) -> np.ndarray:
@@ -28,7 +33,9 @@ def add_lens_curves(
     )
 
 
-def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarray, bench: LensBench):
+def _curves(
+    design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarray, bench: LensBench
+) -> Figure:
     figure = new_figure(13, 3.6)
     axes = figure.subplots(1, 3)
     middle = height.shape[0] // 2

@@ -40,7 +40,7 @@ def identity(design: Design) -> dict[str, object]:
     }
 
 
-def progress_figure(history: list[dict[str, float]], design: Design):
+def progress_figure(history: list[dict[str, float]], design: Design) -> Figure:
     """Loss against iteration."""
     figure = new_figure(8, 3.4)
     axis = figure.subplots()

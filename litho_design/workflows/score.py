@@ -8,8 +8,10 @@ from typing import Any
 
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
+from litho_design.images.photograph import PhotoSource
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
+from litho_design.judging.measured import MeasuredSource
+from litho_design.judging.score import ScoreResult, judge_design
 from litho_design.large.lens import judge_rings
 from litho_design.large.score import judge_in_bands
 from litho_design.optics.thin_element import ElementKind
