@@ -23,7 +23,7 @@ from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
 from litho_data.making.assemble import Source
 from litho_data.making.build import make_store
-from litho_data.making.jobs import piece_of
+from litho_data.making.chain import Chain
 from litho_data.making.operations import OPERATIONS
 from litho_data.making.result import BuildResult
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
@@ -120,9 +120,9 @@ class PairsJob:
 
     def run(self) -> Piece:
         """The stitched field as a piece."""
-        done = OPERATIONS["stitch-pairs"].run(self._params, self.files, {})
-        return piece_of(
-            [done],
+        chain = Chain()
+        chain.run("stitch-pairs", self._params, self.files)
+        return chain.piece(
             id=self.id,
             key=self.key(),
             use="dataset",

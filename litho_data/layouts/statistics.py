@@ -11,11 +11,9 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Result
-from litho_data.roughness.amplitude import autocorrelation
 
 _FEWEST_PX = 64
 _BIN_PER_UM = 0.05
-_LONGEST_LAG_UM = 5.0
 
 
 class LayoutStatistics(Result):
@@ -26,13 +24,10 @@ class LayoutStatistics(Result):
         jump_share: share of neighbouring pixel pairs (along x and y) that differ by 0, 1, 2 … levels.
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
         power_share: share of the power (mean level excluded) in each bin, sums to 1.
-        lag_um: lags of the autocorrelation, µm.
-        autocorrelation_x, autocorrelation_y: autocorrelation of the level about the layout's mean, 1 at lag
-            0.
         settings: settings of a set that ``write_layout_set`` made, otherwise None.
     """
 
-    SCHEMA: ClassVar[str] = "litho-data/layouts/1"
+    SCHEMA: ClassVar[str] = "litho-data/layouts/2"
     FILE_NAME: ClassVar[str] = "layouts.json"
 
     count: int
@@ -42,9 +37,6 @@ class LayoutStatistics(Result):
     jump_share: list[float]
     frequency_per_um: list[float]
     power_share: list[float]
-    lag_um: list[float]
-    autocorrelation_x: list[float]
-    autocorrelation_y: list[float]
     settings: dict[str, Any] | None = None
 
 
@@ -62,7 +54,6 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
     levels_count = np.zeros(levels, np.int64)
     jumps_count = np.zeros(levels, np.int64)
     powers: list[Array] = []
-    correlations: list[Array] = []
     for layout in layouts:
         level = _checked(layout, levels)
         levels_count += np.bincount(level.ravel(), minlength=levels)
@@ -70,12 +61,9 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
             jumps = np.abs(np.diff(level.astype(int), axis=axis)).ravel()
             jumps_count += np.bincount(jumps, minlength=levels)
         powers.append(_radial_power(level, pitch_um))
-        correlations.append(_autocorrelation(level, pitch_um))
     if not powers:
         raise InputError("layouts", got="none", wanted="at least one")
-    shortest = min(one.shape[1] for one in correlations)
     power = np.mean(powers, axis=0)
-    correlation = np.mean([one[:, :shortest] for one in correlations], axis=0)
     return LayoutStatistics(
         count=len(powers),
         levels=levels,
@@ -84,9 +72,6 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
         jump_share=(jumps_count / jumps_count.sum()).tolist(),
         frequency_per_um=((np.arange(power.size) + 0.5) * _BIN_PER_UM).tolist(),
         power_share=(power / (power.sum() or 1.0)).tolist(),
-        lag_um=(np.arange(shortest) * pitch_um).tolist(),
-        autocorrelation_x=correlation[1].tolist(),
-        autocorrelation_y=correlation[0].tolist(),
     )
 
 
@@ -114,13 +99,3 @@ def _radial_power(level: Array, pitch_um: float) -> Array:
     limit = int(np.ceil(0.5 / pitch_um / _BIN_PER_UM))
     power = np.bincount(np.minimum(bins, limit - 1), weights=spectrum.ravel(), minlength=limit)
     return power / (power.sum() or 1.0)
-
-
-def _autocorrelation(level: Array, pitch_um: float) -> Array:
-    """Autocorrelation along y and x, shape (2, lags); for a constant layout 0 except at lag 0."""
-    lags = min(round(_LONGEST_LAG_UM / pitch_um) + 1, min(level.shape) // 2)
-    if level.min() == level.max():
-        return np.eye(1, lags).repeat(2, axis=0)
-    correlation = autocorrelation(level)
-    middle = correlation.shape[1] // 2
-    return np.stack([correlation[:lags, middle], correlation[0, middle : middle + lags]])

@@ -22,7 +22,7 @@ _LEAST_SHARE = 1e-6
 
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
-    """Pictures of the first layouts, level and jump shares, spectrum and autocorrelation."""
+    """Pictures of the first layouts, level and jump shares, spectrum."""
     from litho_data.readers import read_layout
 
     page = Page(
@@ -32,9 +32,9 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     first = {file.stem: read_layout(file) for file in files[:_SHOWN]}
     page.figure(layouts_figure(first, (0, statistics.levels - 1)), "The first layouts, level by colour.")
 
-    graphs = new_figure(11, 6)
+    graphs = new_figure(11, 3)
     levels = np.arange(statistics.levels)
-    (of_levels, of_jumps), (of_power, of_lags) = graphs.subplots(2, 2)
+    of_levels, of_jumps, of_power = graphs.subplots(1, 3)
     of_levels.bar(levels, statistics.level_share)
     of_levels.set(xlabel="level", ylabel="share of pixels")
     shares = {"yscale": "log", "ylim": (_LEAST_SHARE, 1.5)}
@@ -42,10 +42,6 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     of_jumps.set(xlabel="jump between neighbours, levels", ylabel="share of pairs", **shares)
     of_power.step(statistics.frequency_per_um, statistics.power_share, where="mid")
     of_power.set(xlabel="spatial frequency, cycles/µm", ylabel="share of power", **shares)
-    of_lags.plot(statistics.lag_um, statistics.autocorrelation_x, label="along x")
-    of_lags.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")
-    of_lags.set(xlabel="lag, µm", ylabel="autocorrelation")
-    of_lags.legend()
     page.figure(graphs, "Pooled statistics of the set.")
     page.heading("In numbers", folded=True)
     numbers = {

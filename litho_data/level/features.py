@@ -30,7 +30,7 @@ _LEAST_BACKGROUND = 0.02
 @operation("mark-features")
 def mark_features(
     z: Array,
-    chosen: Array | None,
+    chosen: Array,
     *,
     threshold: Threshold = 3.0,
     side: Side = "both",
@@ -52,17 +52,15 @@ def mark_features(
     Raises:
         InputError: a threshold that is not positive, an unknown side, a negative ``grow_px``.
     """
-    values = z if chosen is None else z[chosen]
-    centre = float(np.median(values))
-    usable = np.isfinite(z) if chosen is None else chosen
-    features = _off_surface(z - centre, usable, threshold * noise_sigma(values - centre), side, grow_px)
-    return features | (np.isfinite(z) & ~usable)
+    centre = float(np.median(z[chosen]))
+    limit = threshold * noise_sigma(z[chosen] - centre)
+    return _off_surface(z - centre, chosen, limit, side, grow_px) | (np.isfinite(z) & ~chosen)
 
 
 @operation("mask-and-relevel")
 def mask_and_relevel(
     z: Array,
-    chosen: Array | None,
+    chosen: Array,
     *,
     x_degree: Degree = 1,
     y_degree: Degree = 1,
@@ -81,22 +79,21 @@ def mask_and_relevel(
         InputError: parameters outside their range, or features that leave no background.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
-    usable = np.isfinite(z) if chosen is None else chosen
     surface = robust_surface(z, chosen, terms)
     # The noise is estimated only once: over the remaining pixels it would shrink in every round.
-    limit = threshold * noise_sigma((z - surface)[usable])
+    limit = threshold * noise_sigma((z - surface)[chosen])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):
-        features = _off_surface(z - surface, usable, limit, side, grow_px)
-        background = usable & ~features
-        if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(usable):
+        features = _off_surface(z - surface, chosen, limit, side, grow_px)
+        background = chosen & ~features
+        if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(chosen):
             raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
         surface = evaluate(fit_terms(z, background, terms), z.shape)
         key = np.packbits(features).tobytes()
         if key in seen:
             break
         seen.add(key)
-    return MaskedLevelling(subtract(z, surface), features | (np.isfinite(z) & ~usable))
+    return MaskedLevelling(subtract(z, surface), features | (np.isfinite(z) & ~chosen))
 
 
 def _off_surface(residual: Array, usable: Array, limit: float, side: Side, grow_px: int) -> Array:

@@ -13,6 +13,7 @@ from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, subtract
+from litho_data.register.geometry import apply_transform, lattice
 from litho_data.register.topography import smooth_measured
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ _LEAST_INSIDE = 0.25
 @operation("layout-aware")
 def level_layout_aware(
     z: Array,
-    chosen: Array | None,
+    chosen: Array,
     *,
     layout_level: Array,
     blur_px: Annotated[float, Field(ge=0)] | None = None,
@@ -63,8 +64,7 @@ def level_layout_aware(
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
     blurs = _BLURS_PX if blur_px is None else (blur_px,)
     known = np.isfinite(layout_level)
-    inside = _inside(known, 2 * blurs[-1])
-    fitted = inside if chosen is None else chosen & inside
+    fitted = chosen & _inside(known, 2 * blurs[-1])
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
     level = np.asarray(layout_level, dtype=float)
@@ -101,19 +101,16 @@ def layout_in_scan_frame(
     Returns:
         float64 of ``scan_shape``. Nearest pixel: levels are labels and must not be mixed.
     """
-    y_um = (np.arange(scan_shape[0]) + 0.5) * scan_pitch_um[0]
-    x_um = (np.arange(scan_shape[1]) + 0.5) * scan_pitch_um[1]
-    grid_y, grid_x = np.meshgrid(y_um, x_um, indexing="ij")
+    points_um = lattice(
+        *((np.arange(n) + 0.5) * pitch for n, pitch in zip(scan_shape, scan_pitch_um, strict=True))
+    )
     if bend_um is not None:
-        shift_x, shift_y = bend_um.shift(grid_x, grid_y)
-        grid_x, grid_y = grid_x + shift_x, grid_y + shift_y
-    mapped = np.tensordot(scan_to_layout, np.stack([grid_x, grid_y, np.ones_like(grid_x)]), axes=1)
-    column = np.floor(mapped[0] / mapped[2] / layout_pitch_um).astype(int)
-    row = np.floor(mapped[1] / mapped[2] / layout_pitch_um).astype(int)
+        points_um = bend_um.straighten(points_um)
+    column, row = np.floor(apply_transform(scan_to_layout, points_um).T / layout_pitch_um).astype(int)
     inside = (row >= 0) & (row < layout_level.shape[0]) & (column >= 0) & (column < layout_level.shape[1])
-    levels = np.full(scan_shape, np.nan)
+    levels = np.full(len(points_um), np.nan)
     levels[inside] = layout_level[row[inside], column[inside]]
-    return levels
+    return levels.reshape(scan_shape)
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:

@@ -16,11 +16,13 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The steps that a recipe can hold, by operation."""
+# Arguments that are no settings, because they come with the scan, and what messages call them.
+_OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What passes from step to step: heights (µm), the current mask, pitch and layout."""
+    """What passes from step to step: heights (µm), the current mask, pitch and layout if they are known."""
 
     height_um: Array
     mask: Array | None
@@ -38,8 +40,8 @@ class Step(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # The fields of the state that the operation takes, and whether each is optional.
-    takes: ClassVar[dict[str, bool]]
+    # Which arguments come with the scan, and whether they are optional.
+    of_scan: ClassVar[dict[str, bool]]
 
     op: str
     masking: Masking = "exclude"
@@ -47,53 +49,48 @@ class Step(BaseModel):
     def run(self, state: State) -> State:
         """The state with the levelled map, with the marked pixels as its mask, or with both."""
         arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
-        for name, optional in self.takes.items():
+        for name, optional in self.of_scan.items():
             arguments[name] = getattr(state, name)
             if arguments[name] is None and not optional:
-                wanted = "the pixel pitch" if name == "pitch_um" else "the layout in the scan's frame"
-                raise InputError(f"{wanted} is unknown", wanted=name)
-        made = type(self).function(state.height_um, mask=state.mask, **arguments)
+                raise InputError(f"{_OF_SCAN[name]} is unknown", wanted=name)
+        made = type(self).function(state.height_um, state.mask, **arguments)
         if isinstance(made, Array):
             return replace(state, mask=made)
         levelled, mask = made if isinstance(made, MaskedLevelling) else (made, state.mask)
         return replace(state, height_um=levelled.height, mask=mask)
 
 
-def operation(op: str, base: type[Step] = Step) -> Callable[[Callable[..., R]], Callable[..., R]]:
+def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Register a function of heights and usable pixels as the operation of that name.
 
-    The function gets heights, float64 (ny, nx), and usable pixels, bool (ny, nx) or None for all. Callers
-    pass a map of any type, a ``mask`` and ``masking``; see ``select``. Keyword arguments that are fields of
-    ``State`` come from the state; all others are fields of the step, checked at every call. It returns a
-    ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
+    The function gets heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of any
+    type, a ``mask`` and ``masking``; see ``select``. Its keyword arguments are fields of the step, checked at
+    every call, except for those that come with the scan. It returns a ``Levelled``, a ``MaskedLevelling``, or
+    pixels to mark as a bool array.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:
         _, _, *parameters = inspect.signature(function, eval_str=True).parameters.values()
-        fields: dict[str, Any] = {"op": (Literal[op], op)}
-        takes = {}
-        for one in parameters:
-            required = one.default is one.empty
-            if one.name in State.__dataclass_fields__:
-                takes[one.name] = not required
-            elif one.name != "masking":
-                fields[one.name] = one.annotation, ... if required else one.default
-        knows_masking = any(one.name == "masking" for one in parameters)
+        fields: dict[str, Any] = {"op": (Literal[op], op)} | {
+            one.name: (one.annotation, ... if one.default is one.empty else one.default) for one in parameters
+        }
+        of_scan = {name: fields.pop(name)[1] is None for name in _OF_SCAN if name in fields}
+        knows_masking = fields.pop("masking", None) is not None
 
         def run(height: Array, mask: Array | None, masking: Masking, **arguments: Any) -> R:
             z = as_height(height)
             arguments |= {"masking": masking} if knows_masking else {}
             return function(z, select(z, mask, masking), **arguments)
 
-        step = create_model(op, __base__=base, **fields)
-        step.function, step.takes = staticmethod(run), takes
+        step = create_model(op, __base__=Step, **fields)
+        step.function, step.of_scan = staticmethod(run), of_scan
         STEPS[op] = step
 
         @wraps(function)
         def checked(
             height: Array, *, mask: Array | None = None, masking: Masking = "exclude", **arguments: Any
         ) -> R:
-            stated = {name: value for name, value in arguments.items() if name not in takes}
+            stated = {name: value for name, value in arguments.items() if name not in of_scan}
             try:
                 step(op=op, masking=masking, **stated)
             except ValidationError as error:

@@ -88,8 +88,7 @@ class Recipe(BaseModel):
             InputError: a step that lacks what it needs, or data that it cannot be applied to.
         """
         if isinstance(scan, Scan):
-            heights, pitch_um = scan.height_um, scan.pitch_um
-            mask = scan.mask if mask is None else mask
+            heights, mask, pitch_um = scan.height_um, scan.mask if mask is None else mask, scan.pitch_um
         else:
             heights = scan
         state = State(as_height(heights), mask, pitch_um, layout_level)

@@ -8,16 +8,9 @@ from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
-from litho_data.level.operation import State, Step, operation
-from litho_data.level.row_statistics import (
-    MEDIAN_TRIM,
-    METRE_PER_UM,
-    fewest_for_row,
-    row_counts,
-    row_facet_tilt,
-    row_modus,
-    row_trimmed_mean,
-)
+from litho_data.level.operation import operation
+from litho_data.level.plane import prevailing_slope
+from litho_data.level.row_statistics import METRE_PER_UM, row_modus, row_trimmed_mean
 from litho_data.level.selection import Levelled, Masking, subtract
 
 RowMethod = Literal[
@@ -31,6 +24,7 @@ RowMethod = Literal[
     "facet-tilt",
 ]
 Direction = Literal["horizontal", "vertical"]
+_MEDIAN_TRIM, _FEWEST_SLOPES = 0.5, 4
 _SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
@@ -38,31 +32,19 @@ class LevellingWarning(UserWarning):
     """A step may have removed part of the print."""
 
 
-class _Aligned(Step):
-    direction: Direction = "horizontal"
-
-    def run(self, state: State) -> State:
-        """The state with the levelled map; warns where the print moves with the lines."""
-        levelled = super().run(state)
-        pair = (state.height_um, state.height_um - levelled.height_um)
-        if note := print_taken_for_offsets(*(one.T if self.direction == "vertical" else one for one in pair)):
-            warnings.warn(note, LevellingWarning, stacklevel=2)
-        return levelled
-
-
-@operation("align-rows", _Aligned)
+@operation("align-rows")
 def align_rows(
     z: Array,
-    chosen: Array | None,
+    chosen: Array,
     *,
     method: RowMethod = "median",
     direction: Direction = "horizontal",
     degree: Annotated[int, Field(ge=0, le=5)] = 1,
-    trim: Annotated[float, Field(ge=0, le=MEDIAN_TRIM)] = 0.05,
+    trim: Annotated[float, Field(ge=0, le=_MEDIAN_TRIM)] = 0.05,
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Remove from each scan line what it does not share with the others.
+    """Remove from each scan line what it does not share with the others; warns where the print moves with it.
 
     Args:
         z: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
@@ -81,16 +63,16 @@ def align_rows(
         InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
     """
     upright = direction == "horizontal"
-    lines, usable = z, chosen
-    if not upright:
-        lines, usable = np.ascontiguousarray(z.T), None if chosen is None else np.ascontiguousarray(chosen.T)
-    trim = {"median": MEDIAN_TRIM, "median-of-differences": MEDIAN_TRIM, "polynomial": 0.0}.get(method, trim)
+    lines, usable = (z, chosen) if upright else map(np.ascontiguousarray, (z.T, chosen.T))
+    trim = {"median": _MEDIAN_TRIM, "median-of-differences": _MEDIAN_TRIM, "polynomial": 0.0}.get(
+        method, trim
+    )
     match method:
         case "facet-tilt":
             if pitch_um is None:
                 raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
-            slopes = row_facet_tilt(lines, usable, pitch_um[1 if upright else 0])
-            removed = np.multiply.outer(slopes, _centred(lines.shape[1]))
+            tilts = _facet_tilts(lines, usable, pitch_um[1 if upright else 0])
+            removed = np.multiply.outer(tilts, _centred(lines.shape[1]))
         case "polynomial" if degree > 0:
             removed = _row_polynomials(lines, usable, degree)
         case "matching":
@@ -101,8 +83,10 @@ def align_rows(
             removed = _level_shifts(row_modus(lines, usable), lines, usable, fewest=1)
         case _:
             means = row_trimmed_mean(lines, usable, trim)
-            removed = _level_shifts(means, lines, usable, fewest_for_row(lines.shape[1]))
+            removed = _level_shifts(means, lines, usable, _fewest(lines))
     removed = np.broadcast_to(removed if removed.ndim == 2 else removed[:, None], lines.shape)
+    if note := print_taken_for_offsets(lines, removed):
+        warnings.warn(note, LevellingWarning, stacklevel=2)
     return subtract(z, removed if upright else removed.T)
 
 
@@ -127,62 +111,65 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
     return f"{shifted} did not move: part of the print may be removed"
 
 
-def _level_shifts(shifts: Array, z: Array, chosen: Array | None, fewest: int) -> Array:
-    """The statistics of the rows, mean zero; rows with too few pixels take that of the whole map."""
-    if chosen is not None:
-        values = z[chosen]
-        shifts[row_counts(z, chosen) < fewest] = np.partition(values, values.size // 2)[values.size // 2]
+def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
+    """The statistics of the rows, mean zero; rows with too few pixels take the median of the whole map."""
+    values = np.sort(z[chosen])
+    shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
     return shifts - shifts.mean()
 
 
-def _difference_shifts(z: Array, chosen: Array | None, trim: float) -> Array:
-    steps = np.diff(z, axis=0)
-    both = None if chosen is None else chosen[1:] & chosen[:-1]
-    step = row_trimmed_mean(steps, both, trim)
-    if both is not None:
-        step[row_counts(steps, both) < fewest_for_row(z.shape[1])] = 0.0
-    shifts = np.concatenate([[0.0], np.cumsum(step)])
+def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
+    both = chosen[1:] & chosen[:-1]
+    steps = np.where(both.sum(axis=1) < _fewest(z), 0.0, row_trimmed_mean(np.diff(z, axis=0), both, trim))
+    shifts = np.concatenate([[0.0], np.cumsum(steps)])
     # Steps alone cannot separate drift from slope, so the linear part stays in the data.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
-def _matching_shifts(z: Array, chosen: Array | None, last_column_counts: bool) -> Array:
+def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
     """Weighted mean steps between rows.
 
     Args:
         last_column_counts: use the last column whatever the mask says, as in Gwyddion's include mode.
     """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
-    usable = np.ones(steps_m.shape, dtype=bool) if chosen is None else chosen[1:] & chosen[:-1]
+    usable = chosen[1:] & chosen[:-1]
     bends_m = np.diff(steps_m, axis=1)
     scale_m = (np.abs(bends_m) * usable[:, :-1]).sum(axis=1) / bends_m.shape[1]
-    weights = np.exp(-(bends_m**2) / (2 * np.where(scale_m > 0, scale_m, 1.0))[:, None])
-    weights[~usable[:, :-1]] = 0.0
-    pixel_weights = np.zeros_like(steps_m)
-    pixel_weights[:, :-1] += weights
-    pixel_weights[:, 1:] += weights
+    weights = np.exp(-(bends_m**2) / (2 * np.where(scale_m > 0, scale_m, 1.0))[:, None]) * usable[:, :-1]
+    pixel_weights = np.pad(weights, ((0, 0), (0, 1))) + np.pad(weights, ((0, 0), (1, 0)))
     if last_column_counts:
         usable[:, -1] = np.isfinite(z[1:, -1] - z[:-1, -1])
-    pixel_weights[~usable] = 0.0
     total = 2 * weights.sum(axis=1)
-    step_m = (pixel_weights * steps_m).sum(axis=1) / np.where(total > 0, total, 1.0)
+    step_m = (pixel_weights * usable * steps_m).sum(axis=1) / np.where(total > 0, total, 1.0)
     shifts = np.concatenate([[0.0], np.cumsum(step_m)]) / METRE_PER_UM
     return shifts - shifts.mean()
 
 
-def _row_polynomials(z: Array, chosen: Array | None, degree: int) -> Array:
+def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
     """The fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds back."""
-    overall = float(np.nanmean(z))
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
-    if chosen is None:
-        directions, _ = np.linalg.qr(basis)
-        return (z @ directions) @ directions.T - overall
-    fitted = np.zeros_like(z)
-    for i in np.flatnonzero(row_counts(z, chosen) > degree):
+    fitted = np.zeros(z.shape)
+    for i in np.flatnonzero(chosen.sum(axis=1) > degree):
         coefficients, *_ = np.linalg.lstsq(basis[chosen[i]], z[i, chosen[i]], rcond=None)
         fitted[i] = basis @ coefficients
-    return fitted - overall
+    return fitted - float(np.nanmean(z))
+
+
+def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
+    """Slope per pixel of the prevailing facet of each row, from neighbours that are both selected."""
+    slopes, both = np.diff(z, axis=1) / pitch_um, chosen[:, 1:] & chosen[:, :-1]
+    tilts = np.zeros(len(z))
+    for i in np.flatnonzero(both.sum(axis=1) >= _FEWEST_SLOPES):
+        found = prevailing_slope(slopes[i, both[i]][None], sharpness=1 / 200, passes=30, settled2=1e-12)
+        tilts[i] = found[0] * pitch_um
+    return tilts
+
+
+def _fewest(lines: Array) -> int:
+    """How many selected values a row needs before its own estimate counts."""
+    return int(np.log(lines.shape[1]) + 1.5)
 
 
 def _centred(n: int) -> Array:

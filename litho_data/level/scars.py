@@ -20,7 +20,7 @@ Count = Annotated[int, Field(ge=1)]
 @operation("mark-scars")
 def mark_scars(
     z: Array,
-    chosen: Array | None,
+    chosen: Array,
     *,
     high: Threshold = 0.666,
     low: Threshold = 0.25,
@@ -53,7 +53,7 @@ def mark_scars(
         if sign in ("both", "positive" if direction > 0 else "negative"):
             prominence = _prominence(direction * z, max_width_px) / rms
             scars |= _long_runs(prominence, low, high, min_length_px)
-    return scars if chosen is None else scars & chosen
+    return scars & chosen
 
 
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
@@ -77,7 +77,7 @@ def remove_scars(height: Array, *, scars: Array) -> Levelled:
 
 @operation("remove-scars")
 @wraps(mark_scars)
-def _fill_scars(z: Array, chosen: Array | None, **how: Any) -> Levelled:
+def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
     return remove_scars(z, scars=mark_scars(z, mask=chosen, masking="include", **how))
 
 

@@ -1,6 +1,5 @@
 """What all levelling operations share: the choice of pixels, and the result."""
 
-import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,7 +8,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 
 Masking = Literal["ignore", "exclude", "include"]
-_ROWS_IN_CACHE = 32
 
 
 class Levelled(NamedTuple):
@@ -42,23 +40,18 @@ def as_height(height: Array) -> Array:
     return z
 
 
-def select(z: Array, mask: Array | None, masking: Masking) -> Array | None:
-    """Pixels that an operation may use, bool (ny, nx); None where it may use all of them.
-
-    Pixels that were not measured (NaN) are never used.
+def select(z: Array, mask: Array | None, masking: Masking) -> Array:
+    """Pixels that an operation may use, bool (ny, nx); never those that were not measured (NaN).
 
     Raises:
         InputError: a mask that is not boolean or has another shape, or a selection without any pixel.
     """
-    chosen = None
+    chosen = np.isfinite(z)
     if mask is not None and masking != "ignore":
         if mask.dtype != np.bool_ or mask.shape != z.shape:
             raise InputError("mask", got=f"{mask.dtype} {mask.shape}", wanted=f"bool {z.shape}")
-        chosen = ~mask if masking == "exclude" else mask
-    if not math.isfinite(float(z.sum())):
-        measured = np.isfinite(z)
-        chosen = measured if chosen is None else chosen & measured
-    if chosen is not None and not chosen.any():
+        chosen &= ~mask if masking == "exclude" else mask
+    if not chosen.any():
         raise InputError("no pixel is left to level with", wanted="a mask that leaves measured pixels")
     return chosen
 
@@ -66,16 +59,3 @@ def select(z: Array, mask: Array | None, masking: Masking) -> Array | None:
 def subtract(z: Array, removed: Array) -> Levelled:
     """The map minus the surface."""
     return Levelled(z - removed, removed)
-
-
-def subtract_product(z: Array, along_y: Array, along_x: Array) -> Levelled:
-    """The map minus the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
-
-    It works on a few rows at a time, so that the surface is still in the cache when it is subtracted.
-    """
-    levelled = Levelled(np.empty_like(z), np.empty_like(z))
-    for first in range(0, len(z), _ROWS_IN_CACHE):
-        rows = slice(first, first + _ROWS_IN_CACHE)
-        surface = np.matmul(along_y[rows], along_x, out=levelled.removed[rows])
-        np.subtract(z[rows], surface, out=levelled.height[rows])
-    return levelled

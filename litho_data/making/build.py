@@ -200,14 +200,14 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
     # One search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
-        read = fields[key].read()
-        if "raw_height_um" not in read.arrays:
+        chain = fields[key].begin()
+        if "raw_height_um" not in chain.arrays:
             continue
         own = layouts[key].tobytes() if key in layouts else None
         others = {name: layouts[name] for held, name in distinct.items() if held != own}
-        height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
+        height_um, (pitch_y_um, pitch_x_um) = chain.arrays["raw_height_um"], chain.pitch_um
         pitch_um = fields[key].card.layout.pitch_um
-        if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):
+        if fits := fitting_layout(height_um, (pitch_y_um, pitch_x_um), others, pitch_um):
             named[key] = f"it shows the layout of {fits}"
             skipped[key] += f"; {named[key]}"
     return named

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from litho_data.foundation.errors import InputError
-from litho_data.making.jobs import FieldJob, scaled_pitch_um
+from litho_data.making.jobs import FieldJob
 from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
@@ -37,10 +37,9 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 def tip_of(job: FieldJob) -> PeakRadius | None:
     """What one scan says about the tip, in calibrated lengths if there are standards; None if unreadable."""
     try:
-        read, calibrated = job.read(), job.calibrate()
+        chain = job.begin()
     except InputError:
         return None
-    scales = {} if calibrated is None else calibrated.facts
-    pitch_y_um, pitch_x_um = scaled_pitch_um(read.facts["pitch_um"], scales)
-    height_um = read.arrays["raw_height_um"].astype(float) * scales.get("scale_z", 1.0)
+    pitch_y_um, pitch_x_um = chain.pitch_um
+    height_um = chain.arrays["raw_height_um"].astype(float) * chain.scales.get("scale_z", 1.0)
     return peak_radius(height_um, (pitch_y_um, pitch_x_um))

@@ -3,9 +3,8 @@
 Jobs travel to other processes and machines, so they hold paths and plain parameters only.
 """
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,10 +14,9 @@ from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.kinds import Array
-from litho_data.foundation.run_facts import software_record
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
-from litho_data.making.operations import OPERATIONS, READERS
-from litho_data.making.step import Done
+from litho_data.making.chain import Chain
+from litho_data.making.operations import OPERATIONS
 from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
@@ -49,13 +47,6 @@ class Skipped:
 
     id: str
     reason: str
-
-
-def piece_of(steps: Sequence[Done], **said: Any) -> Piece:
-    """The piece that these steps made, with further facts for its record."""
-    record = {**said, "steps": [done.step.to_record() for done in steps], "software": software_record()}
-    arrays = {name: array for done in steps for name, array in done.arrays.items()}
-    return Piece(json.loads(json.dumps(record)), arrays)
 
 
 def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
@@ -93,18 +84,8 @@ class FieldJob:
 
     def key(self) -> str:
         """Hash of everything that determines the piece."""
-        one = self.field
-        described = [
-            one.id,
-            one.print_id,
-            one.order,
-            one.use,
-            one.full_scale_um,
-            dict(one.columns),
-            dict(one.read),
-        ]
-        plan = [described, self.scan_name, self.layout_name, self.recipe, self.seed]
-        plan.append(self.card.model_dump(mode="json"))
+        described = {**asdict(self.field), "scan": self.scan_name, "layout": self.layout_name}
+        plan = [described, self.recipe, self.seed, self.card.model_dump(mode="json")]
         own = (self.field.scan, self.field.layout, *self.standards.files.values())
         files = [file_sha256(path) for path in own if path is not None]
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
@@ -112,52 +93,51 @@ class FieldJob:
 
     def layout(self) -> Array | None:
         """Levels of its layout; None if it has no layout that can be read."""
+        chain = Chain()
         try:
-            done = self._read_layout()
+            self._read_layout(chain)
         except InputError:
             return None
-        return None if done is None else done.arrays["mask_level"]
+        return chain.arrays.get("mask_level")
 
-    def read(self) -> Done:
-        """The scan as it was read; InputError if that fails."""
+    def begin(self) -> Chain:
+        """Layout and scan as they were read, and the scales; InputError if one of them cannot be had."""
+        chain = Chain()
+        self._read_layout(chain)
         file = {self.scan_name: self.field.scan}
         if self._is_micrograph:
-            return OPERATIONS["read-micrograph"].run({"size_um": self._read_params["size_um"]}, file, {})
-        return OPERATIONS["read-scan"].run(self._read_params, file, {})
+            chain.run("read-micrograph", {"size_um": self._read_params["size_um"]}, file)
+        else:
+            chain.run("read-scan", self._read_params, file)
+        if self.standards.described:
+            described = {"standards": [dict(one) for one in self.standards.described]}
+            chain.run("calibrate", described, self.standards.files)
+        return chain
 
-    def calibrate(self) -> Done | None:
-        """The scales of the microscope, None without standards; InputError if these cannot be measured."""
-        if not self.standards.described:
-            return None
-        described = {"standards": [dict(one) for one in self.standards.described]}
-        return OPERATIONS["calibrate"].run(described, self.standards.files, {})
-
-    def register_params(self, pitch_um: Sequence[float], fast_axis: str | None) -> dict[str, Any]:
-        """Parameters of a registration of scans with this (y, x) pitch."""
-        pitches = {"scan_pitch_um": pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
-        lines = {"fast_axis": "y"} if fast_axis == "y" else {}  # if unknown, the lines are taken as rows
+    def register_params(self, chain: Chain) -> dict[str, Any]:
+        """Parameters of a registration of the scan that was read."""
+        pitches = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
+        # If unknown, the lines are taken as rows.
+        lines = {"fast_axis": "y"} if chain.read["fast_axis"] == "y" else {}
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 
     def run(self) -> Piece:
         """The finished scan; InputError if its files do not allow it."""
-        steps = list(self._steps())
-        arrays = {name: array for done in steps for name, array in done.arrays.items()}
-        facts = {done.step.op: done.facts for done in steps}
+        chain = self.begin()
+        (self._cover if self._is_micrograph else self._level)(chain)
+        arrays, facts = chain.arrays, chain.facts
         quality: dict[str, Any] = {}
         for op in ("register", "uncertainty", "tip", "calibrate", "find-edges", "cover"):
             quality |= facts.get(op, {})
-        read = next(facts[op] for op in READERS if op in facts)
-        notes = [*read.get("notes", ()), *facts.get("level", {}).get("notes", ())]
-        said = (quality.get("warning", ""), *notes)
-        quality["warning"] = "; ".join(filter(None, said))
+        notes = [*chain.read.get("notes", ()), *facts.get("level", {}).get("notes", ())]
+        quality["warning"] = "; ".join(filter(None, (quality.get("warning", ""), *notes)))
         if "removed_um" in arrays:
             removed_nm = 1e3 * arrays["removed_um"].astype(float)
             quality["removed_range_nm"] = float(np.nanmax(removed_nm) - np.nanmin(removed_nm))
             quality["removed_sd_nm"] = float(np.nanstd(removed_nm))
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
-        return piece_of(
-            steps,
+        return chain.piece(
             id=self.id,
             key=self.key(),
             use=self.field.use,
@@ -166,74 +146,59 @@ class FieldJob:
             columns=dict(self.field.columns),
             quality=quality,
             notes=notes,
-            read=read,
-            pitch_um=scaled_pitch_um(read["pitch_um"], facts.get("calibrate", {})),
+            read=chain.read,
+            pitch_um=chain.pitch_um,
         )
 
-    def _steps(self) -> Iterator[Done]:
-        """The operations in order; each takes the arrays that it needs from the operations before it."""
-        held: dict[str, Array] = {}
+    def _cover(self, chain: Chain) -> None:
+        """The rest of the chain for a micrograph: edges, registration, coverage on the layout's grid."""
+        full_level = self.card.layout.levels - 1
+        film = {"film_um": full_level * self.card.layout.level_height_um}
+        edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film})
+        chain.run("register", self.register_params(chain))
+        sigma = {"edge_sigma_um": edges["edge_sigma_nm"] / 1e3, "full_level": full_level}
+        chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
-        def kept(done: Done) -> Done:
-            held.update(done.arrays)
-            return done
-
-        def made(op: str, params: Mapping[str, Any]) -> Done:
-            return kept(OPERATIONS[op].run(params, {}, held))
-
-        if (layout := self._read_layout()) is not None:
-            yield kept(layout)
-        read = kept(self.read())
-        yield read
-        pitch_um = read.facts["pitch_um"]
-        if (scales := self.calibrate()) is not None:
-            yield kept(scales)
-            pitch_um = scaled_pitch_um(pitch_um, scales.facts)
-        pitch = {"scan_pitch_um": pitch_um}
-        pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
-        # The layout does not show what lies around the field, so the outermost pixels are no evidence.
-        aside = {"edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else {}
-        register_params = self.register_params(pitch_um, read.facts["fast_axis"])
-        if self._is_micrograph:
-            full_level = self.card.layout.levels - 1
-            film = {"film_um": full_level * self.card.layout.level_height_um}
-            edges = made("find-edges", {**pitch, **film})
-            yield edges
-            yield made("register", register_params)
-            sigma = {"edge_sigma_um": edges.facts["edge_sigma_nm"] / 1e3, "full_level": full_level}
-            place = {**pitches, "layout_shape": list(held["mask_level"].shape)}
-            yield made("cover", {**place, **film, **sigma, "dirt_px": _DIRT_PX, "edge_px": 0, **aside})
-            return
+    def _level(self, chain: Chain) -> None:
+        """The rest of the chain for heights: levelling, and for the dataset registration and resampling."""
+        of_dataset = self.field.use == "dataset"
+        pitch = {"scan_pitch_um": chain.pitch_um}
         recipe = dict(self.recipe)
-        if layout is None or (self.field.use != "dataset" and not np.ptp(held["mask_level"])):
+        if "mask_level" not in chain.arrays or not (of_dataset or np.ptp(chain.arrays["mask_level"])):
             # A reference has no layout, or a flat one that cannot be located.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
-            yield made("locate", register_params)
-        yield made("level", {**pitch, "recipe": recipe})
-        if self.field.use != "dataset":
+            chain.run("locate", self.register_params(chain))
+        chain.run("level", {**pitch, "recipe": recipe})
+        if not of_dataset:
             return
-        registered = made("register", register_params)
-        yield registered
+        found = chain.run("register", self.register_params(chain))
         if self.card.process.tip is not None:
-            yield made("tip", {**pitch, "radius_um": self.card.process.tip})
-        yield made("resample", {**pitches, "layout_shape": list(held["mask_level"].shape), **aside})
-        fit = {name: registered.facts[name] for name in ("blur_um", "model")}
-        lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(recipe["step"])}
-        yield made("uncertainty", {**pitches, **fit, **lines})
+            chain.run("tip", {**pitch, "radius_um": self.card.process.tip})
+        chain.run("resample", self._place(chain))
+        fit = {name: found[name] for name in ("blur_um", "model")}
+        lines = {"fast_axis": chain.read["fast_axis"] or "x", "levelled": bool(recipe["step"])}
+        chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
-    def _read_layout(self) -> Done | None:
-        """The layout as it was read, None if the field has none; InputError if that fails."""
+    def _place(self, chain: Chain) -> dict[str, Any]:
+        """The layout's grid, and how many of its outermost pixels are no evidence.
+
+        The layout does not show what lies around the field.
+        """
+        grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
+        grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
+        return {**grid, "edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else grid
+
+    def _read_layout(self, chain: Chain) -> None:
         if self.field.layout is None or self.layout_name is None:
-            return None
-        file = {self.layout_name: self.field.layout}
+            return
         params: dict[str, Any] = {"levels": self.card.layout.levels}
         for name in ("grey_per_level", "average_px"):
             if (value := getattr(self.card.layout, name)) is not None:
                 params[name] = value
         if self._surround == "substrate":
             params["bare_px"] = _BARE_PX
-        return OPERATIONS["read-layout"].run(params, file, {})
+        chain.run("read-layout", params, {self.layout_name: self.field.layout})
 
     @property
     def _is_micrograph(self) -> bool:
@@ -254,11 +219,6 @@ class FieldJob:
         # Facts from the table must agree with the file; those from the card are only defaults.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
-
-
-def scaled_pitch_um(pitch_um: Sequence[float], scales: Mapping[str, float]) -> list[float]:
-    """A stated (y, x) pitch times the scales of its axes, if they are known."""
-    return [one * scales.get(f"scale_{axis}", 1.0) for axis, one in zip("yx", pitch_um, strict=True)]
 
 
 def field_jobs(listing: Listing, recipe: Mapping[str, Any], seed: int = 0) -> list[FieldJob]:

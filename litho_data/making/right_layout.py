@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.kinds import YX, Array
-from litho_data.register.geometry import ORIENTATIONS
 from litho_data.register.orientation import search_orientation
 from litho_data.register.refine import interior_of
 from litho_data.register.scan import at_layout_pitch
-from litho_data.register.topography import pearson, predicted_topography, remove_bow
+from litho_data.register.topography import predicted_topography, remove_bow
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
@@ -25,8 +24,6 @@ _SIDE_PX = 128
 _EDGE_PX = 2
 # Another layout must explain a scan this much better, in correlation.
 _BETTER = 0.02
-# Error of correlations by matrix products in float32; scans per product.
-_ROUNDING, _AT_ONCE = 1e-3, 64
 # A print of another layout reaches 0.3 to 0.5 at its best shift, one of this layout 0.9.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
@@ -91,15 +88,12 @@ def fitting_layout(
         pitch_um: pitch of the layouts.
     """
     flat = remove_bow(at_layout_pitch(height_um, scan_pitch_um, pitch_um))
-    scores = {}
+    scores = [(0.0, ""), (0.0, "")]
     for name, level in layouts.items():
-        found = search_orientation(flat, predicted_topography(level, _BLUR_PX), tuple(ORIENTATIONS), (1,))
-        scores[name] = found[0].ncc if found else 0.0
-    ranked = sorted(scores, key=lambda name: scores[name], reverse=True)
-    if not ranked or scores[ranked[0]] < _FITS:
-        return ""
-    rival = scores[ranked[1]] if len(ranked) > 1 else 0.0
-    return ranked[0] if scores[ranked[0]] - rival > _LEAD else ""
+        found = search_orientation(flat, predicted_topography(level, _BLUR_PX))
+        scores += [(one.ncc, name) for one in found if one.polarity == 1][:1]
+    (best, fitting), (rival, _) = sorted(scores, reverse=True)[:2]
+    return fitting if best >= _FITS and best - rival > _LEAD else ""
 
 
 def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
@@ -125,84 +119,56 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     )
 
 
-def _other_layouts(prints: Sequence[Print]) -> list[tuple[str, str]]:
+def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Scans that another layout of the set explains better, at the warp found for their own layout."""
-    said = []
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
         # A layout that was printed more than once is named by its first id.
         distinct = list({one.layout: one for one in reversed(alike)}.values())
-        place = {one.layout: k for k, one in enumerate(distinct)}
-        for one, found in zip(alike, _correlations(alike, distinct), strict=True):
-            own = found[place[one.layout]]
-            found[place[one.layout]] = -1.0
-            best = distinct[int(found.argmax())]
-            if found.max() > own + _BETTER - _ROUNDING:
-                fits, fits_own = _correlation(one, best), _correlation(one, one)
-                if fits > fits_own + _BETTER:
-                    better = f"correlation {fits:.3f}, own {fits_own:.3f}"
-                    said.append((one.id, f"its heights fit the layout of {best.id} better: {better}"))
-    return said
+        layouts = np.stack([one.topography.ravel() for one in distinct])
+        for one in alike:
+            found = _correlations(one.height.ravel(), layouts)
+            own = found[next(k for k, other in enumerate(distinct) if other.layout == one.layout)]
+            if found.max() > own + _BETTER:
+                best = distinct[int(found.argmax())].id
+                better = f"correlation {found.max():.3f}, own {own:.3f}"
+                yield one.id, f"its heights fit the layout of {best} better: {better}"
 
 
-def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator[Array]:
-    """Correlations of each scan with each layout, within ``_ROUNDING``, by matrix products."""
-    of_layouts = np.stack([one.topography.ravel() for one in layouts]).astype(np.float32)
-    of_layouts -= of_layouts.mean(axis=1, keepdims=True)
-    squares = of_layouts**2
-    for start in range(0, len(prints), _AT_ONCE):
-        height = np.stack([one.height.ravel() for one in prints[start : start + _AT_ONCE]])
-        seen = np.isfinite(height)
-        count = np.maximum(seen.sum(axis=1), 1)
-        height = np.where(seen, height, 0).astype(np.float32)
-        height = np.where(seen, height - (height.sum(axis=1) / count)[:, None], 0).astype(np.float32)
-        mask = seen.astype(np.float32)
-        spread = mask @ squares.T - (mask @ of_layouts.T) ** 2 / count[:, None]
-        energy = spread * (height**2).sum(axis=1)[:, None]
-        yield from (height @ of_layouts.T) / np.sqrt(np.where(energy > 0, energy, np.inf))
+def _correlations(height: Array, layouts: Array) -> Array:
+    """Correlations of heights (pixels,), NaN where not measured, with layouts (n, pixels); 0 if flat."""
+    seen = np.isfinite(height)
+    own, others = (one - one.mean(axis=-1, keepdims=True) for one in (height[seen], layouts[:, seen]))
+    energy = (others**2).sum(axis=1, dtype=float) * (own**2).sum(dtype=float)
+    products: Array = (others * own).sum(axis=1, dtype=float)
+    return products / np.sqrt(np.where(energy > 0, energy, np.inf))
 
 
-def _correlation(one: Print, other: Print) -> float:
-    """Correlation of the heights of one scan with the layout of another."""
-    seen = np.isfinite(one.height)
-    return pearson(one.height[seen].astype(float), other.topography[seen])
-
-
-def _orientations(prints: Sequence[Print]) -> list[tuple[str, str]]:
-    """Scans that lie mirrored or turned on their layout, unlike the others of the set."""
-    if not prints:
-        return []
-    usual, count = Counter(one.dihedral for one in prints).most_common(1)[0]
-    said = []
-    for one in prints:
-        if one.turned:
-            # The card says so.
-            continue
+def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
+    """Scans that lie mirrored or turned on their layout, unlike the others of the set or the card."""
+    usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
+    for one in (one for one in prints if not one.turned):
         if one.dihedral != usual and 2 * count > len(prints):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
             what = "a mirror image of its layout" if mirrored else f"turned ({one.dihedral})"
-            said.append((one.id, f"{what}, unlike the other scans: is the file of its layout the right one?"))
+            yield one.id, f"{what}, unlike the other scans: is the file of its layout the right one?"
         elif one.dihedral in MIRRORED:
-            said.append((one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"))
-    return said
+            yield one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"
 
 
-def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
+def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Scans whose height per level fits another group better, and doses that are out of order."""
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
     logs = np.array([np.log(max(abs(one.response[0]), 1e-12)) for one in prints])
     if repeated:
-        logs -= [
-            np.median([logs[k] for k, other in enumerate(prints) if other.layout == one.layout])
-            for one in prints
-        ]
+        layouts = np.array([one.layout for one in prints])
+        logs -= [np.median(logs[layouts == layout]) for layout in layouts]
     groups = {
         group: np.array([one.group == group for one in prints]) for group in {one.group for one in prints}
     }
     middle = {group: float(np.median(logs[members])) for group, members in groups.items()}
-    said = []
     for k, one in enumerate(prints):
         if groups[one.group].sum() < 3:
             continue
@@ -211,7 +177,7 @@ def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
         if off > _CLEAR_SIGMA * scatter and nearest != one.group:
             percent = 100 * np.expm1(logs[k] - middle[one.group])
             text = f"height per level {percent:+.0f} % off the others of {one.group}, as in {nearest}"
-            said.append((one.id, f"{text}: is its id or dose the right one?"))
+            yield one.id, f"{text}: is its id or dose the right one?"
     growth = np.array([one.response[1] for one in prints])
     rising = {
         group: (middle[group], int(members.sum()))
@@ -219,7 +185,9 @@ def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
         if isinstance(group, float) and np.median(growth[members]) > 0
     }
     traded = _traded_doses(rising, scatter)
-    return said + [(one.id, traded[one.group]) for one in prints if one.group in traded]
+    yield from (
+        (one.id, traded[one.group]) for one in prints if isinstance(one.group, float) and one.group in traded
+    )
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
@@ -254,9 +222,7 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Messages for the doses that must be swapped for the height per level to rise with the dose.
-
-    Two doses may have been swapped, or the order of all reversed.
+    """Messages for the doses that are out of order, if the height per level clearly falls somewhere.
 
     Args:
         rising: for each dose whose prints should rise with more dose: log of the height per level, number of
@@ -266,25 +232,13 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     doses = sorted(rising)
     values = np.array([rising[dose][0] for dose in doses])
     error = scatter / np.sqrt([rising[dose][1] for dose in doses])
-    clear = _CLEAR_SIGMA * np.hypot.outer(error, error)
-
-    def falls(order: Array) -> bool:
-        return bool((np.triu(order[:, None] - order[None, :] - clear, 1) > 0).any())
-
-    count = len(doses)
-    trades = [[(i, j)] for i in range(count) for j in range(i + 1, count)]
-    trades.append([(i, count - 1 - i) for i in range(count // 2)])
-    rights = []
-    for trade in trades:
-        order = values.copy()
-        for i, j in trade:
-            order[[i, j]] = values[[j, i]]
-        if not falls(order):
-            rights.append((float(order @ np.arange(count)), trade))
-    if not falls(values) or not rights:
+    falls = values[:, None] - values - _CLEAR_SIGMA * np.hypot.outer(error, error)
+    if not (np.triu(falls, 1) > 0).any():
         return {}
+    # The rank of a value is the place of the dose that it belongs to.
+    pairs = {k: sorted((k, int(rank))) for k, rank in enumerate(np.argsort(np.argsort(values)))}
     return {
         doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"
-        for i, j in max(rights)[1]
-        for k in (i, j)
+        for k, (i, j) in pairs.items()
+        if i != j
     }

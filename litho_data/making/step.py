@@ -59,15 +59,6 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Done:
-    """A finished step with its arrays and facts."""
-
-    step: Step
-    arrays: Arrays
-    facts: Facts
-
-
-@dataclass(frozen=True)
 class Operation:
     """A pure function of recorded parameters and inputs.
 
@@ -91,8 +82,10 @@ class Operation:
         """Hash of the source that the result depends on."""
         return _code_sha256(self.code)
 
-    def run(self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]) -> Done:
-        """Run the operation and record it.
+    def run(
+        self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]
+    ) -> tuple[Step, Arrays, Facts]:
+        """Run the operation: its record, and what it made.
 
         Args:
             params: explicit parameters, plain data.
@@ -115,7 +108,7 @@ class Operation:
             raise InputError(f"cannot read {', '.join(map(str, files.values()))}", got=str(error)) from error
         outputs = tuple(_described(name, array) for name, array in made.items())
         step = Step(self.name, self.version, dict(params), tuple(inputs), outputs, self.code_sha256)
-        return Done(step, made, facts)
+        return step, made, facts
 
 
 @cache

@@ -17,8 +17,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.kinds import Array
 from litho_data.level.recipe import Recipe
-from litho_data.making.jobs import FieldJob, field_jobs, scaled_pitch_um
-from litho_data.making.operations import OPERATIONS, load_recipe
+from litho_data.making.jobs import FieldJob, field_jobs
+from litho_data.making.operations import load_recipe
 
 if TYPE_CHECKING:
     from litho_data.reports.page import Page
@@ -107,13 +107,13 @@ def suggest_recipe(
         if len(pictures) == _SCANS:
             break
         try:
-            raw_um, layout, pitch_um = _located(job)
+            raw_um, layout = _located(job)
         except InputError as error:
             refusal = f"{job.id}: {error}"
             continue
         pictures[job.id] = [raw_um]
         for name, text in RECIPES.items():
-            height_um, note = _levelled(text, raw_um, layout, pitch_um)
+            height_um, note = _levelled(text, raw_um, layout)
             left[name][job.id] = 1e3 * left_by_layout(height_um, layout)
             pictures[job.id].append(height_um)
             warned |= {name: note} if note else {}
@@ -137,24 +137,18 @@ def _best(left_nm: Mapping[str, float]) -> str:
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
-def _located(job: FieldJob) -> tuple[Array, Array, Sequence[float]]:
-    """Raw heights (ny, nx) µm, the layout in the scan's frame, NaN outside it, and the pitch (y, x)."""
-    read, layout, calibrated = job.read(), job.layout(), job.calibrate()
-    if layout is None:
-        raise InputError(f"layout of {job.id}", got="none that can be read")
-    pitch_um = scaled_pitch_um(read.facts["pitch_um"], calibrated.facts if calibrated else {})
-    raw = read.arrays["raw_height_um"]
-    params = job.register_params(pitch_um, read.facts["fast_axis"])
-    found = OPERATIONS["locate"].run(params, {}, {"mask_level": layout, "raw_height_um": raw})
-    return raw.astype(float), found.arrays["layout_in_scan"], pitch_um
+def _located(job: FieldJob) -> tuple[Array, Array]:
+    """Raw heights (ny, nx) µm, and the layout in the scan's frame, NaN outside it."""
+    chain = job.begin()
+    chain.run("locate", job.register_params(chain))
+    return chain.arrays["raw_height_um"].astype(float), chain.arrays["layout_in_scan"]
 
 
-def _levelled(recipe: str, raw_um: Array, layout: Array, pitch_um: Sequence[float]) -> tuple[Array, str]:
+def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
     """The heights, and objections to the recipe; a recipe that cannot be applied leaves them unchanged."""
-    pitch = (float(pitch_um[0]), float(pitch_um[1]))
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
-        levelled, notes = steps.apply_noting(raw_um, pitch_um=pitch, layout_level=layout)
+        levelled, notes = steps.apply_noting(raw_um, layout_level=layout)
     except InputError as error:
         return raw_um, str(error)
     return levelled.height, "; ".join(notes)

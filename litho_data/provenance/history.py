@@ -192,9 +192,9 @@ def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Arra
         for one in step.inputs:
             if one["name"] in files:
                 _require_same(files[one["name"]], one["sha256"])
-        done = OPERATIONS[step.op].run(step.params, files, made)
-        made |= done.arrays
-        yield from done.arrays.items()
+        _, arrays, _ = OPERATIONS[step.op].run(step.params, files, made)
+        made |= arrays
+        yield from arrays.items()
 
 
 def _require_same(path: Path, sha256: str) -> None:

@@ -14,11 +14,11 @@ from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.making.assemble import root_attributes, table_sha256
 from litho_data.making.operations import OPERATIONS
 from litho_data.provenance.history import Recorded, raw_folder, read_steps, require_folder, stored_array
-from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
+from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table
 from litho_data.store.contract import file_names, missing_files, read_documents
 from litho_data.store.read import Store
-from litho_data.store.schema import LAYOUT_VARIABLES, MIXED_UNITS, STORE_SCHEMA, VARIABLES
-from litho_data.store.write import PADDING, pixel_centres_um
+from litho_data.store.schema import STORE_SCHEMA, VARIABLES
+from litho_data.store.write import PADDING
 
 F = TypeVar("F")
 
@@ -74,7 +74,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
         return Verification((*findings, Finding("store", str(error))), (), 0, 0, 0)
     arrays = list(progress(_guarded(_arrays(store, history)), "hashing arrays"))
     findings += [finding for finding in arrays if finding]
-    for check in (_attributes, _tables, _padding, _coordinates):
+    for check in (_attributes, _tables, _padding):
         findings += _guarded(check(store))
     findings += _guarded(_steps(store, history))
     notes = list(_other_code(history))
@@ -205,20 +205,6 @@ def _padding(store: Store) -> Iterator[Finding]:
             rest = np.concatenate([field[ny:].ravel(), field[:ny, nx:].ravel()])
             if not np.array_equal(rest, np.full_like(rest, fill), equal_nan=True):
                 yield Finding(f"{name} of scan {scan_id}", "padding is not empty")
-
-
-def _coordinates(store: Store) -> Iterator[Finding]:
-    shape = array_of(store.root, "mask_level").shape
-    for name, count in (("y_um", shape[1]), ("y", shape[1]), ("x_um", shape[2]), ("x", shape[2])):
-        if not np.array_equal(values_of(store.root, name), pixel_centres_um(count, store.pitch_um)):
-            yield Finding(f"coordinate {name}", "is not at pixel centres")
-    for variable in LAYOUT_VARIABLES:
-        if not has_child(store.root, variable.name):
-            continue
-        attributes = array_of(store.root, variable.name).attrs
-        if variable.name not in MIXED_UNITS and attributes.get("units") != variable.unit:
-            problem = f"is {attributes.get('units')!r}, but the schema says {variable.unit!r}"
-            yield Finding(f"unit of {variable.name}", problem)
 
 
 def _other_code(history: Recorded) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""How well a registration is known: held-out blocks, bootstrap, correlation, information."""
+"""How well a registration is known: held-out blocks, bootstrap, correlation."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.geometry import corners
-from litho_data.register.refine import BORDER_PX, Refinement, corner_motion_px, solve_gram
+from litho_data.register.refine import BORDER_PX, Refinement, corner_motion_px, interior_of, solve_gram
 from litho_data.register.topography import pearson, smooth_measured
 
 WINDOW_CELLS = 4
@@ -55,12 +55,6 @@ class BlockShifts:
             if np.ptp(means) > SMALLEST_CURVE_PX and sigmas > CLEAR_CURVE_SIGMA:
                 return True
         return False
-
-    def by_line(self, slow: int, pitch_um: float) -> str:
-        """Mean shift (x, y) of the blocks at each place along the slow axis, as ``µm: px px; …``."""
-        places = self.middle_px[:, slow]
-        rows = [(place, *self.shift_px[places == place].mean(axis=0)) for place in np.unique(places)]
-        return "; ".join(f"{(at + 0.5) * pitch_um:.1f}: {x:+.2f} {y:+.2f}" for at, x, y in rows)
 
     def _by_place(self, axis: int, along: int) -> list[Array]:
         places = self.middle_px[:, along]
@@ -131,32 +125,10 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
     Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
     """
-    chosen = _interior(height)
+    chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:
         return float("nan")
     return pearson(smooth_measured(height, 1.0)[chosen], layout_level[chosen].astype(float))
-
-
-def mutual_information_bit(height: Array, layout_level: Array) -> float:
-    """Mutual information of height (64 equally filled classes) and level over the same pixels, bit."""
-    chosen = _interior(height)
-    if chosen.sum() < 16:
-        return float("nan")
-    values = height[chosen]
-    classes = np.searchsorted(np.quantile(values, np.arange(1, 64) / 64), values)
-    levels = layout_level[chosen].astype(np.int64)
-    counts = np.bincount(levels * 64 + classes, minlength=64 * (levels.max() + 1))
-    joint = counts.reshape(-1, 64) / len(values)
-    product = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
-    present = joint > 0
-    return float((joint[present] * np.log2(joint[present] / product[present])).sum())
-
-
-def _interior(height: Array) -> Array:
-    chosen = np.zeros(height.shape, bool)
-    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
-    chosen[inner] = np.isfinite(height[inner])
-    return chosen
 
 
 def _peak(score: Array) -> Array:

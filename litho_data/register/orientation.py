@@ -1,8 +1,6 @@
 """Orientation, sign and rough position, by masked normalised cross-correlation over all shifts."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -28,12 +26,7 @@ class Hypothesis:
     layout_to_oriented: Array
 
 
-def search_orientation(
-    scan: Array,
-    topography: Array,
-    orientations: tuple[str, ...] = tuple(ORIENTATIONS),
-    polarities: tuple[int, ...] = (1, -1),
-) -> list[Hypothesis]:
+def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
     """All hypotheses, best first, by masked correlation of low-resolution copies.
 
     Args:
@@ -42,16 +35,13 @@ def search_orientation(
 
     Returns:
         Empty if the scan or the layout shows no structure at all.
-
-    The correlation is that of D. Padfield, Masked object registration in the Fourier domain,
-    IEEE Trans. Image Process. 21 (2012), doi:10.1109/TIP.2011.2181402, eq. 11.
     """
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
     found = []
-    turned = [orient(small_scan, orientation) for orientation in orientations]
-    correlations = masked_correlations(small_topography, turned)
-    for orientation, moving, (correlation, overlap) in zip(orientations, turned, correlations, strict=True):
+    for orientation in ORIENTATIONS:
+        moving = orient(small_scan, orientation)
+        correlation, overlap = masked_correlation(small_topography, moving)
         if np.isnan(correlation).all():
             continue
         # Breaks ties only: on a repeating layout, the shift with the larger overlap is the better guess.
@@ -59,7 +49,7 @@ def search_orientation(
         # The centre of a block of `factor` pixels is (factor - 1) / 2 after its first pixel; rotating a scan
         # whose size is no multiple of the factor moves the remainder to the other side.
         cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
-        for polarity in polarities:
+        for polarity in (1, -1):
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
             # Shifts run from -(fixed size - 1) to moving size - 1, the negative ones wrapped to the end.
             shift_y = int(row) - (correlation.shape[0] if row >= moving.shape[0] else 0)
@@ -67,9 +57,8 @@ def search_orientation(
             matrix = np.array(
                 [[1.0, 0, factor * shift_x + cut_x], [0, 1, factor * shift_y + cut_y], [0, 0, 1]]
             )
-            found.append(
-                Hypothesis(orientation, polarity, float(polarity * correlation[row, column]), matrix)
-            )
+            ncc = float(polarity * correlation[row, column])
+            found.append(Hypothesis(orientation, polarity, ncc, matrix))
     return sorted(found, key=lambda hypothesis: -hypothesis.ncc)
 
 
@@ -82,9 +71,7 @@ def rival_alignment(registered: Array, topography: Array) -> float:
     from scipy.ndimage import maximum_filter
 
     factor = max(1, round(max(topography.shape) / (2 * SEARCH_SIZE_PX)))
-    fixed = reduce_image(topography, factor)
-    moving = fixed if registered is topography else reduce_image(registered, factor)
-    correlation, _ = next(masked_correlations(fixed, [moving]))
+    correlation, _ = masked_correlation(reduce_image(topography, factor), reduce_image(registered, factor))
     own = correlation[0, 0]
     if not np.isfinite(own) or own <= 0:
         return float("nan")
@@ -100,8 +87,8 @@ def rival_orientation(registered: Array, topography: Array) -> float:
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
     rivals = []
-    correlations = masked_correlations(small, [orient(scan, orientation) for orientation in ORIENTATIONS])
-    for orientation, (correlation, _) in zip(ORIENTATIONS, correlations, strict=True):
+    for orientation in ORIENTATIONS:
+        correlation, _ = masked_correlation(small, orient(scan, orientation))
         if not np.isnan(correlation).all():
             rivals.append(-np.nanmin(correlation))
             if orientation != "identity":
@@ -119,59 +106,46 @@ def reduce_image(image: Array, factor: int) -> Array:
     return np.divide(total, count, out=np.full((ny, nx), np.nan), where=2 * count > factor**2)
 
 
-def masked_correlations(fixed: Array, movings: Sequence[Array]) -> Iterator[tuple[Array, Array]]:
-    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap, for each.
+def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
+    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
 
-    Yields:
+    D. Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Process. 21 (2012),
+    doi:10.1109/TIP.2011.2181402, eq. 11.
+
+    Returns:
         Correlation and number of overlapping pixels, indexed by the shift modulo their shape; the
         correlation is NaN if less than ``MIN_OVERLAP`` of the smaller image overlaps or one side is constant.
     """
-    from scipy.fft import irfft2, next_fast_len, rfft2
+    from scipy.fft import irfft2, next_fast_len
 
-    @cache
-    def of_fixed(shape: Shape) -> tuple[Array, Array, Array]:
-        return rfft2(np.isfinite(fixed).astype(float), shape), *_height_spectra(fixed, shape)
+    ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
+    shape = (ny, nx)
+    (mask1, height1, square1), (mask2, height2, square2) = (_spectra(one, shape) for one in (fixed, moving))
 
-    def under(measured: Array, shape: Shape) -> tuple[Array, ...]:
-        """Pixels of the fixed image under those of the moving one: number, sum, energy about the mean."""
-        mask = rfft2(measured.astype(float), shape)
-        number, total, energy = (irfft2(np.conj(part) * mask, shape) for part in of_fixed(shape))
-        number = np.maximum(np.rint(number), 1.0)
-        return number, total, energy - total**2 / number
+    def summed(one: Array, other: Array) -> Array:
+        return irfft2(np.conj(one) * other, shape)
 
-    @cache
-    def under_complete(moving_shape: Shape, shape: Shape) -> tuple[Array, ...]:
-        return under(np.ones(moving_shape, bool), shape)
-
-    for moving in movings:
-        ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
-        shape, measured = (ny, nx), np.isfinite(moving)
-        # A rotated scan without gaps covers the same pixels.
-        complete = measured.all()
-        overlap, total1, variance1 = (
-            under_complete(moving.shape, shape) if complete else under(measured, shape)
-        )
-        m1, f1, f1f1 = of_fixed(shape)
-        f2, f2f2 = (f1, f1f1) if moving is fixed else _height_spectra(moving, shape)
-        total2 = irfft2(np.conj(m1) * f2, shape)
-        variance2 = irfft2(np.conj(m1) * f2f2, shape) - total2**2 / overlap
-        covariance = irfft2(np.conj(f1) * f2, shape) - total1 * total2 / overlap
-        least = MIN_OVERLAP * min(np.isfinite(fixed).sum(), measured.sum())
-        # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
-        usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
-        product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
-        yield np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+    overlap = np.maximum(np.rint(summed(mask1, mask2)), 1.0)
+    total1, total2 = summed(height1, mask2), summed(mask1, height2)
+    variance1 = summed(square1, mask2) - total1**2 / overlap
+    variance2 = summed(mask1, square2) - total2**2 / overlap
+    covariance = summed(height1, height2) - total1 * total2 / overlap
+    least = MIN_OVERLAP * min(np.isfinite(one).sum() for one in (fixed, moving))
+    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
+    usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
+    product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
+    return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
 
 
-def _height_spectra(image: Array, shape: Shape) -> tuple[Array, Array]:
-    """Transforms of an image's heights, scaled to unit energy and 0 where not measured, and their squares."""
+def _spectra(image: Array, shape: Shape) -> list[Array]:
+    """Transforms of where an image was measured, of its heights at unit energy, and of their squares."""
     from scipy.fft import rfft2
 
     measured = np.isfinite(image)
     mean = image[measured].mean() if measured.any() else 0.0
     values = np.where(measured, image - mean, 0.0)
     values /= max(float(np.sqrt((values**2).mean())), 1e-300)
-    return rfft2(values, shape), rfft2(values**2, shape)
+    return [rfft2(one, shape) for one in (measured.astype(float), values, values**2)]
 
 
 def _cut_off(orientation: str, shape: Shape, factor: int) -> tuple[int, int]:

@@ -31,8 +31,6 @@ class RegistrationQuality:
     defect_share: float
     ncc_before: float
     ncc_after: float
-    mutual_information_before_bit: float
-    mutual_information_after_bit: float
     ecc: float
     blur_um: float
     tre_windows: int
@@ -44,7 +42,6 @@ class RegistrationQuality:
     curve_y_px: float
     curve_x_by_y_px: float
     curve_y_by_x_px: float
-    shift_by_line_px: str  # mean shift (x, y) of the blocks by place along the slow axis, "µm: px px; …"
     corner_sd_px: float
     corner_sd_nm: float
     singular_max: float

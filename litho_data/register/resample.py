@@ -46,46 +46,27 @@ def resample_to_layout(
     A scan sampled more finely than the layout is first averaged over the layout's pixel (Gaussian of
     the missing width), since plain interpolation would alias its noise.
     """
-    resampler = Resampler(height_um, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um)
-    return resampler.at(scan_to_layout, layout_shape, bend_um)
+    from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 
-
-class Resampler:
-    """`resample_to_layout` for several transforms of one scan; the spline is fitted once."""
-
-    def __init__(self, height_um: Array, *, scan_pitch_um: YX, layout_pitch_um: float):
-        from scipy.ndimage import spline_filter
-
-        height = np.asarray(height_um, dtype=float)
-        self._measured = np.isfinite(height)
-        if not self._measured.any():
-            raise InputError("scan", got="no measured pixel", wanted="finite heights")
-        self._pitch_um = scan_pitch_um
-        self._um_to_index = np.linalg.inv(index_to_um(scan_pitch_um))
-        self._layout_to_um = index_to_um((layout_pitch_um, layout_pitch_um))
-        filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
-        self._spline = spline_filter(filled, SPLINE_ORDER, mode="mirror")
-
-    def at(
-        self, scan_to_layout: Array, layout_shape: Shape, bend_um: Bend | None = None
-    ) -> tuple[Array, Array]:
-        """Height and validity under a transform (of the straightened scan), on a layout of this shape."""
-        from scipy.ndimage import binary_dilation, map_coordinates
-
-        matrix = np.asarray(scan_to_layout, dtype=float)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
-            raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
-        to_scan = self._um_to_index @ np.linalg.inv(matrix) @ self._layout_to_um
-        bend = None if bend_um is None else bend_um.in_pixels(self._pitch_um)
-        rows, columns = warped_grid(to_scan, layout_shape, bend)
-        places = (rows, columns)
-        values = map_coordinates(self._spline, places, order=SPLINE_ORDER, mode="mirror", prefilter=False)
-        ny, nx = self._measured.shape
-        valid = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
-        if not self._measured.all():
-            near_gap = binary_dilation(~self._measured, np.ones((3, 3), bool)).astype(np.float32)
-            valid &= map_coordinates(near_gap, places, order=1, mode="nearest") == 0
-        return np.where(valid, values, np.nan).astype(np.float32), valid
+    height, matrix = np.asarray(height_um, dtype=float), np.asarray(scan_to_layout, dtype=float)
+    measured = np.isfinite(height)
+    if not measured.any():
+        raise InputError("scan", got="no measured pixel", wanted="finite heights")
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
+    layout_to_um = index_to_um((layout_pitch_um, layout_pitch_um))
+    to_scan = np.linalg.inv(index_to_um(scan_pitch_um)) @ np.linalg.inv(matrix) @ layout_to_um
+    bend = None if bend_um is None else bend_um.in_pixels(scan_pitch_um)
+    places = rows, columns = warped_grid(to_scan, layout_shape, bend)
+    filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
+    spline = spline_filter(filled, SPLINE_ORDER, mode="mirror")
+    values = map_coordinates(spline, places, order=SPLINE_ORDER, mode="mirror", prefilter=False)
+    ny, nx = height.shape
+    valid = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
+    if not measured.all():
+        near_gap = binary_dilation(~measured, np.ones((3, 3), bool)).astype(np.float32)
+        valid &= map_coordinates(near_gap, places, order=1, mode="nearest") == 0
+    return np.where(valid, values, np.nan).astype(np.float32), valid
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:

@@ -1,5 +1,6 @@
 """Registration of one scan onto the layout it was printed from."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,9 +10,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
-from litho_data.register.creep import refine_bent, refine_with_creep
+from litho_data.register.curved import refine_curved
 from litho_data.register.defects import refine_around_defects, without_defects
-from litho_data.register.evidence import BlockShifts, height_correlation, mutual_information_bit
+from litho_data.register.evidence import BlockShifts, height_correlation
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
 from litho_data.register.flows import Model
 from litho_data.register.geometry import (
@@ -26,7 +27,7 @@ from litho_data.register.orientation import rival_alignment
 from litho_data.register.pyramid import FineFit, climb, refine_pyramid
 from litho_data.register.quality import MAX_LAYOUT_REPEATS, RegistrationQuality, judge, unregistered_quality
 from litho_data.register.refine import Refinement
-from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
+from litho_data.register.resample import noise_variance_factor, resample_to_layout
 from litho_data.register.topography import predicted_topography, remove_bow
 from litho_data.scan import Axis, Scan
 
@@ -118,17 +119,27 @@ def register_scan(
         oriented = without_defects(oriented, defects, fine.refinement.layout_to_scan)
     if model == "ladder":
         fine = climb(fine)
+    before = _on_layout(height, centred, layout.shape, scan_pitch_um, layout_pitch_um)
+    known = {
+        "layout_repeats": layout_repeats,
+        "ncc_before": height_correlation(before, layout),
+        "defect_share": 0.0 if defects is None else float(defects.mean()),
+        "noise_variance_factor": noise_variance_factor(scan_pitch_um, layout_pitch_um),
+    }
+    case = _Case(height, layout, scan_pitch_um, layout_pitch_um, seed, defects, known)
     slow = slow_axis(coarse.orientation, fast_axis)
-    case = _Case(height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, seed, defects, slow)
     straight, blocks = case.registration(coarse, fine)
     if model not in BENDABLE or not features:
         return straight
     found = [straight] if straight.quality.passed else []
-    if blocks.bends_along(slow) and (crept := refine_with_creep(oriented, layout, fine, slow)):
+    if blocks.bends_along(slow) and (crept := refine_curved(oriented, layout, fine, slow)):
         with_creep, _ = case.registration(coarse, crept)
         if with_creep.quality.passed:
             found = [with_creep]
-    if not straight.quality.passed and (curved := refine_bent(oriented, layout, fine)) is not None:
+    if (
+        not straight.quality.passed
+        and (curved := refine_curved(oriented, layout, fine, "quadratic")) is not None
+    ):
         bent, _ = case.registration(coarse, curved)
         found += [bent] if _explains(bent.quality, straight.quality) else []
     return min(found, key=lambda one: one.quality.tre_median_px, default=straight)
@@ -141,26 +152,22 @@ def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan and its layout, with what is needed to judge a warp between them."""
+    """One scan and its layout; ``known``: the figures that do not depend on the warp between them."""
 
     height_um: Array
     layout: Array
     scan_pitch_um: YX
     layout_pitch_um: float
-    centred: Array
-    layout_repeats: float
     seed: int
     defects: Array | None
-    slow: int
+    known: Mapping[str, float]
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
         """The fit in µm of both frames, with its figures and the verdict; and the shifts of its blocks."""
         height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
-        resampler = Resampler(height, scan_pitch_um=self.scan_pitch_um, layout_pitch_um=pitch_um)
-        before, _ = resampler.at(self.centred, layout.shape)
-        after, _ = resampler.at(scan_to_layout, layout.shape, bend_um)
+        after = _on_layout(height, scan_to_layout, layout.shape, self.scan_pitch_um, pitch_um, bend_um)
         if self.defects is not None:
             after = np.where(self.defects, np.nan, after)
         evidence, blocks = figures_of_evidence(fine, pitch_um, self.seed)
@@ -168,15 +175,9 @@ class _Case:
             **figures_of_fit(coarse, fine, pitch_um),
             **figures_of_warp(layout_to_scan, layout.shape, pitch_um),
             **evidence,
-            "shift_by_line_px": blocks.by_line(self.slow, pitch_um),
-            "layout_repeats": self.layout_repeats,
+            **self.known,
             "overlap": float(np.isfinite(after).mean()),
-            "defect_share": 0.0 if self.defects is None else float(self.defects.mean()),
-            "ncc_before": height_correlation(before, layout),
             "ncc_after": height_correlation(after, layout),
-            "mutual_information_before_bit": mutual_information_bit(before, layout),
-            "mutual_information_after_bit": mutual_information_bit(after, layout),
-            "noise_variance_factor": noise_variance_factor(self.scan_pitch_um, pitch_um),
         }
         passed, reason, warning = judge(figures, fine.blur_px, bend_um)
         quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
@@ -232,10 +233,25 @@ def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) ->
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
     shape = _shape_at(layout_pitch_um, height.shape, scan_pitch_um)
-    resampled, _ = resample_to_layout(
-        height, np.eye(3), shape, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um
-    )
-    return resampled.astype(float)
+    return _on_layout(height, np.eye(3), shape, scan_pitch_um, layout_pitch_um).astype(float)
+
+
+def _on_layout(
+    height: Array,
+    scan_to_layout: Array,
+    shape: Shape,
+    scan_pitch_um: YX,
+    layout_pitch_um: float,
+    bend_um: Bend | None = None,
+) -> Array:
+    return resample_to_layout(
+        height,
+        scan_to_layout,
+        shape,
+        scan_pitch_um=scan_pitch_um,
+        layout_pitch_um=layout_pitch_um,
+        bend_um=bend_um,
+    )[0]
 
 
 def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> tuple[int, int]:

@@ -12,7 +12,6 @@ from litho_data.roughness.levelling_bias import (
     exponential_correlation,
     gaussian_correlation,
     retained_variance,
-    retained_variance_by_rows,
 )
 from litho_data.roughness.noise import white_noise
 from litho_data.roughness.spectrum import Spectrum, psd_along
@@ -41,7 +40,6 @@ __all__ = [
     "line_period",
     "psd_along",
     "retained_variance",
-    "retained_variance_by_rows",
     "sq_uncertainty_nm",
     "stair_steps",
     "white_noise",

@@ -38,54 +38,31 @@ def retained_variance(
     Sq of a levelled surface is too low by the square root of this share; divide by the root to correct.
 
     Args:
-        shape: (ny, nx), pixels.
+        shape: (ny, nx), pixels; (1, nx) with a degree of (0, n) for rows that are levelled separately.
         pitch_um: pixel pitch, µm.
         correlation: normalised autocorrelation as a function of (y, x) lags, µm.
         degree: largest total degree (1 = plane), or largest degrees along (y, x) for independent
             degrees. Degree 0 subtracts the mean.
     """
-    factors = [_orthonormal_polynomials(size, _largest(degree, axis)) for axis, size in enumerate(shape)]
+    degrees = (degree, degree) if isinstance(degree, int) else degree
+    along_y, along_x = (_orthonormal_polynomials(n, most) for n, most in zip(shape, degrees, strict=True))
     padded = [scipy.fft.next_fast_len(2 * size - 1, real=True) for size in shape]
-    lags_um = [_wrapped_lags(size) * pitch_um for size in padded]
-    transfer = scipy.fft.rfft2(correlation(lags_um[0][:, None], lags_um[1][None, :])).real
+    lags_um = np.meshgrid(*(np.fft.fftfreq(n, 1 / (n * pitch_um)) for n in padded), indexing="ij")
+    transfer = scipy.fft.rfft2(correlation(*lags_um)).real
     removed = 0.0
-    for power_y, along_y in enumerate(factors[0]):
-        for power_x, along_x in enumerate(factors[1]):
-            if isinstance(degree, int) and power_y + power_x > degree:
-                continue
-            term = np.outer(along_y, along_x)
-            smeared = scipy.fft.irfft2(scipy.fft.rfft2(term, padded) * transfer, padded)
-            removed += float(np.sum(term * smeared[: shape[0], : shape[1]]))
+    for power_y, power_x in np.ndindex(len(along_y), len(along_x)):
+        if isinstance(degree, int) and power_y + power_x > degree:
+            continue
+        term = np.outer(along_y[power_y], along_x[power_x])
+        smeared = scipy.fft.irfft2(scipy.fft.rfft2(term, padded) * transfer, padded)
+        removed += float(np.sum(term * smeared[: shape[0], : shape[1]]))
     return 1 - removed / (shape[0] * shape[1])
-
-
-def retained_variance_by_rows(
-    width_px: int, pitch_um: float, correlation: Correlation, *, degree: int
-) -> float:
-    """The same for levelling each row separately by a polynomial of ``degree`` (0 = row mean)."""
-    lags_um = (np.arange(width_px)[:, None] - np.arange(width_px)[None, :]) * pitch_um
-    matrix = correlation(np.zeros(()), lags_um)
-    terms = _orthonormal_polynomials(width_px, degree)
-    return float(1 - np.einsum("ki,ij,kj->", terms, matrix, terms) / width_px)
-
-
-def _largest(degree: int | tuple[int, int], axis: int) -> int:
-    largest = degree if isinstance(degree, int) else degree[axis]
-    if largest < 0:
-        raise InputError("degree of a levelling polynomial", got=degree, wanted="0 or more")
-    return largest
 
 
 def _orthonormal_polynomials(size: int, degree: int) -> Array:
     """Polynomials of degree 0…``degree``, orthonormal over ``size`` pixels, shape (degree + 1, size)."""
-    if size <= degree:
-        raise InputError("pixels for a polynomial", got=size, wanted=f"more than its degree {degree}")
+    if not 0 <= degree < size:
+        raise InputError("degree of a levelling polynomial", got=degree, wanted=f"0 to {size - 1}")
     columns = np.polynomial.legendre.legvander(np.linspace(-1, 1, size), degree)
     orthonormal, _ = np.linalg.qr(columns)
     return orthonormal.T
-
-
-def _wrapped_lags(size: int) -> Array:
-    """Lags 0, 1, … and −1, −2, … in the order of a circular convolution."""
-    lags = np.arange(size)
-    return np.where(lags <= size // 2, lags, lags - size)

@@ -184,7 +184,9 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
     Raises:
         InputError: rows or columns were left out or reversed.
     """
-    for name, count in zip(("y_um", "x_um"), shape, strict=True):
+    for name, count in (
+        (f"{axis}{unit}", n) for axis, n in zip("yx", shape, strict=True) for unit in ("_um", "")
+    ):
         if has_child(root, name):
             found, wanted = values_of(root, name), pixel_centres_um(count, pitch_um)
             if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-6, atol=0):

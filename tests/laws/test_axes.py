@@ -16,7 +16,6 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from litho_data.foundation.grid import PixelGrid
-from litho_data.layouts.statistics import layout_statistics
 from litho_data.making.contour import coverage
 from litho_data.register.resample import resample_to_layout
 from litho_data.register.topography import predicted_topography, remove_bow
@@ -131,13 +130,6 @@ def test_a_map_of_the_exchanged_field_is_the_exchanged_map(made: str, name: str)
 Along = Callable[[Array, PixelGrid, int], Any]
 
 
-def autocorrelation(height: Array, grid: PixelGrid, axis: int) -> Any:
-    # Twice along either axis, to have pixels enough.
-    level = np.tile(np.clip(np.round(20 * height), 0, 12).astype(np.uint8), (2, 2))
-    found = layout_statistics([level], levels=13, pitch_um=0.1)
-    return found.autocorrelation_x if axis else found.autocorrelation_y
-
-
 def step_height(height: Array, grid: PixelGrid, axis: int) -> Any:
     along = np.arange(grid.shape[axis]) * grid.pitch_um[axis]
     ridge = 0.3 * (np.abs(along - 0.4 * along[-1]) < 0.2 * along[-1])
@@ -158,7 +150,6 @@ def smooth_terms(height: Array, grid: PixelGrid, axis: int) -> Any:
 
 ALONG: dict[str, Along] = {
     "power": lambda height, grid, axis: psd_along(height, grid.pitch_um[axis], "yx"[axis]).density,
-    "correlation of a layout": autocorrelation,
     "a step": step_height,
     "slope of a print": slopes,
     "smooth terms of a scan": smooth_terms,

@@ -83,9 +83,7 @@ def test_a_bend_that_is_read_from_the_store_is_the_one_that_was_found(
 ) -> None:
     """Registration works on indices of the turned scan; the store keeps amounts in the scan's own frame."""
     layout_pitch_um = 0.1
-    case = _Case(
-        np.zeros(shape), np.zeros((50, 62), int), pitch_um, layout_pitch_um, np.eye(3), 0.0, 0, None, 0
-    )  # fmt: skip
+    case = _Case(np.zeros(shape), np.zeros((50, 62), int), pitch_um, layout_pitch_um, 0, None, {})
     ny, nx = (round(n * p / layout_pitch_um) for n, p in zip(shape, pitch_um, strict=True))
     turned = orient(np.zeros((ny, nx)), orientation).shape
     bend = Bend.none_yet((turned[0], turned[1]))

@@ -199,9 +199,6 @@ class TestStatistics:
         assert (found.level_share[0], found.level_share[12]) == (0.5, 0.5)
         # 7 edges in 63 neighbours along each axis.
         assert found.jump_share[12] == pytest.approx(7 / 63)
-        # Lags of one cell and two cells.
-        assert found.autocorrelation_x[8] == pytest.approx(-1)
-        assert found.autocorrelation_y[16] == pytest.approx(1)
 
     def test_power_lies_at_the_frequency_of_a_wave(self):
         wave = np.rint(6 + 6 * np.sin(2 * np.pi * 0.625 * np.arange(128) * 0.1))[None].repeat(128, 0)

@@ -23,7 +23,7 @@ from litho_data.level import (
 )
 from litho_data.readers import read_scan
 
-pytestmark = pytest.mark.oracle
+pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore::litho_data.level.LevellingWarning")]
 
 ROW_METHODS = {
     "median": "median",

@@ -20,7 +20,6 @@ from litho_data.level import (
     level_plane,
     level_polynomial,
     level_robust,
-    level_rotate,
     level_three_point,
     mask_and_relevel,
     zero_max,
@@ -28,6 +27,7 @@ from litho_data.level import (
 )
 from litho_data.level.rows import RowMethod
 
+pytestmark = pytest.mark.filterwarnings("ignore::litho_data.level.LevellingWarning")
 PITCH_UM = (0.1, 0.07)
 SHAPES = st.tuples(st.integers(8, 24), st.integers(8, 24))
 SLOPES = st.floats(-0.1, 0.1, allow_subnormal=False)
@@ -336,14 +336,6 @@ def test_median_is_exact_where_float32_cannot_tell_values_apart() -> None:
     np.testing.assert_array_equal(removed, medians - medians.mean())
 
 
-def test_rotation_brings_a_plane_to_a_constant_and_keeps_shape() -> None:
-    z = ramp((30, 40), 0.2, 0.02 * PITCH_UM[1], -0.01 * PITCH_UM[0])
-    rotated = level_rotate(z, pitch_um=PITCH_UM)
-    np.testing.assert_allclose(rotated.height, rotated.height[0, 0], rtol=0, atol=1e-12)
-    flat = np.zeros((30, 40))
-    np.testing.assert_array_equal(level_rotate(flat, pitch_um=PITCH_UM).height, flat)
-
-
 @pytest.mark.parametrize(
     ("operate", "message"),
     [
@@ -364,7 +356,6 @@ def test_rotation_brings_a_plane_to_a_constant_and_keeps_shape() -> None:
         (lambda z: align_rows(z, method="facet-tilt"), "pitch"),
         (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (2, 2)]), "not on one line"),
         (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (99, 2)]), "wanted a pixel"),
-        (lambda z: level_rotate(100 * z, pitch_um=PITCH_UM), "overhang"),
         (lambda z: level_plane(z[0]), "shape"),
     ],
 )

@@ -163,8 +163,8 @@ def test_undo_is_the_inverse_of_straighten_up_to_the_fold():
     assert 0.5 < bend.slope < 1
     points = bend.middle + bend.half * unit
     back = np.stack(bend.undo(*bend.straighten(points).T), axis=1)
-    # Newton ends with a step below 1e-9 half widths, 2e-8 µm, and converges quadratically.
-    np.testing.assert_allclose(back, points, atol=2e-8)
+    # It ends with a step below 1e-9 half widths, 2e-8 µm, and each step is at most 0.9 of the last.
+    np.testing.assert_allclose(back, points, atol=2e-7)
 
 
 def test_a_bend_is_centred_turns_into_pixels_and_is_found_from_its_points():

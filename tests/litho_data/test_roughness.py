@@ -15,7 +15,6 @@ from litho_data.roughness import (
     groove_depth,
     psd_along,
     retained_variance,
-    retained_variance_by_rows,
     sq_uncertainty_nm,
     stair_steps,
 )
@@ -179,7 +178,8 @@ class TestLevellingBias:
         assert retained_variance((32, 40), PITCH_UM, white, degree=(1, 2)) == pytest.approx(
             1 - 6 / 1280, rel=1e-12
         )
-        assert retained_variance_by_rows(40, PITCH_UM, white, degree=1) == pytest.approx(
+        # Rows alone: two terms out of 40 pixels.
+        assert retained_variance((1, 40), PITCH_UM, white, degree=(0, 1)) == pytest.approx(
             1 - 2 / 40, rel=1e-12
         )
 
@@ -187,7 +187,7 @@ class TestLevellingBias:
         # Variance of the mean over L of exp(−|x|/T): 2T/L − 2(T/L)²(1 − e^(−L/T)), the continuous limit.
         ratio = 0.05
         closed = 1 - 2 * ratio + 2 * ratio**2 * (1 - np.exp(-1 / ratio))
-        found = retained_variance_by_rows(1000, 0.01, exponential_correlation(0.5), degree=0)
+        found = retained_variance((1, 1000), 0.01, exponential_correlation(0.5), degree=0)
         # Sampling at T/50 differs from the integral by about (pitch/T)²/6.
         assert found == pytest.approx(closed, rel=2e-4)
 
@@ -208,5 +208,5 @@ class TestLevellingBias:
 
     def test_rows_lose_more_than_the_field(self):
         correlation = gaussian_correlation(0.8)
-        by_rows = retained_variance_by_rows(128, PITCH_UM, correlation, degree=1)
+        by_rows = retained_variance((1, 128), PITCH_UM, correlation, degree=(0, 1))
         assert by_rows < retained_variance((128, 128), PITCH_UM, correlation, degree=1)

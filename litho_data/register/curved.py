@@ -31,54 +31,35 @@ _CHANCE = 0.01
 _BACKGROUND = 6
 
 
-def refine_with_creep(scan: Array, layout_level: Array, straight: FineFit, slow: int) -> FineFit | None:
-    """The straight warp and a creep on top, or None if blocks held out of the fit do not prefer it.
+def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Curve) -> FineFit | None:
+    """The straight warp refined again as an affine and a curve; None if the fit does not converge.
 
-    The displacement along x and y is a polynomial of degree 6 in the slow coordinate, ten numbers besides
-    the affine. Both it and the straight warp are fitted to each half of the field, squares of 64 px in a
-    chequerboard, and each fit predicts the other half.
-
-    Args:
-        scan: (ny, nx) oriented heights at the layout's pitch, NaN where not measured.
-        layout_level: (ny, nx) integer levels.
-        straight: what ``refine_pyramid`` found.
-        slow: axis of the oriented scan along which the lines follow each other, 0 = x, 1 = y.
-    """
-    straight_line = straight.refinement.layout_to_scan, Bend.none_yet(scan.shape)
-    crept = _from_coarse_to_fine(scan, layout_level, straight_line, slow)
-    case = _Images(straight.scan, straight.topography, _EVERY)
-    apart = np.diag([_EVERY, _EVERY, 1.0])
-    whole = case.fit(crept[0] @ apart, crept[1], slow, case.everywhere)
-    if whole is None:
-        return None
-    if not _is_confirmed(case, (straight_line[0] @ apart, straight_line[1]), whole, slow):
-        return None
-    return _with_bend(straight, whole[0] @ np.linalg.inv(apart), whole[1])
-
-
-def refine_bent(scan: Array, layout_level: Array, straight: FineFit) -> FineFit | None:
-    """The straight warp refined again as an affine and a bend of the scan; None if the fit does not converge.
+    Creep displaces along x and y by a polynomial of degree 6 in the slow coordinate, ten numbers besides the
+    affine. It also has to do better on blocks held out of the fit: it and the straight warp are fitted to
+    each half of the field, squares of 64 px in a chequerboard, and each fit predicts the other half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
         straight: the result of ``refine_pyramid``; its error may reach the width of structures at a quarter
             resolution.
+        curve: ``quadratic``, or the axis of the oriented scan along which the lines follow each other.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
-    matrix, bend = _from_coarse_to_fine(scan, layout_level, (affine, Bend.none_yet(scan.shape)), "quadratic")
-    blur_px = match_blur(straight.scan, layout_level, matrix, bend)
+    start = affine, Bend.none_yet(scan.shape)
+    found = _from_coarse_to_fine(scan, layout_level, start, curve)
+    blur_px = match_blur(straight.scan, layout_level, *found)
     topography = predicted_topography(layout_level, blur_px)
-    level = _without_own_bow(straight.scan, topography, warped_grid(matrix, shape, bend))
-    case = _Images(level, topography)
-    whole = case.fit(matrix, bend, "quadratic", case.everywhere)
-    fine = replace(straight, scan=level, topography=topography, blur_px=blur_px)
-    return None if whole is None else _with_bend(fine, *whole)
-
-
-def _with_bend(fine: FineFit, matrix: Array, bend: Bend) -> FineFit:
-    refinement = refine(fine.scan, fine.topography, matrix, "affine", bend=bend)
-    return replace(fine, refinement=replace(refinement, converged=True))
+    level = _without_own_bow(straight.scan, topography, warped_grid(found[0], shape, found[1]))
+    case, apart = _Images(level, topography, _EVERY), np.diag([_EVERY, _EVERY, 1.0])
+    whole = case.fit(found[0] @ apart, found[1], curve, case.everywhere)
+    if whole is None or (
+        curve != "quadratic" and not _is_confirmed(case, (affine @ apart, start[1]), whole, curve)
+    ):
+        return None
+    matrix, bend = whole[0] @ np.linalg.inv(apart), whole[1]
+    refinement = replace(refine(level, topography, matrix, "affine", bend=bend), converged=True)
+    return FineFit(refinement, level, topography, blur_px)
 
 
 def _from_coarse_to_fine(
@@ -113,7 +94,9 @@ def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) 
     return scan - np.einsum("k,kyx->yx", coefficients[1:], basis)
 
 
-def _is_confirmed(case: _Images, straight: tuple[Array, Bend], whole: tuple[Array, Bend], slow: int) -> bool:
+def _is_confirmed(
+    case: _Images, straight: tuple[Array, Bend], whole: tuple[Array, Bend], curve: Curve
+) -> bool:
     from scipy.stats import wilcoxon
 
     ny, nx = case.everywhere.shape
@@ -122,7 +105,7 @@ def _is_confirmed(case: _Images, straight: tuple[Array, Bend], whole: tuple[Arra
     first = (row[:, None] + column) % 2 == 0
     gains = []
     for fold in (first, ~first):
-        with_creep = case.fit(*whole, slow, fold)
+        with_creep = case.fit(*whole, curve, fold)
         without = case.fit(*straight, None, fold)
         if with_creep is None or without is None:
             return False

@@ -1,0 +1,51 @@
+"""The operations on one scan in turn, and the piece of the store that they make."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.kinds import Array
+from litho_data.foundation.run_facts import software_record
+from litho_data.making.operations import OPERATIONS, READERS
+from litho_data.making.step import Facts, Step
+from litho_data.store.partial import Piece
+
+
+@dataclass
+class Chain:
+    """What the operations so far have made: recorded steps, arrays by name, facts by operation."""
+
+    steps: list[Step] = field(default_factory=list)
+    arrays: dict[str, Array] = field(default_factory=dict)
+    facts: dict[str, Facts] = field(default_factory=dict)
+
+    def run(self, op: str, params: Mapping[str, Any], files: Mapping[str, Path] | None = None) -> Facts:
+        """Run an operation on these files and on the arrays made before it; InputError if it cannot be."""
+        step, arrays, self.facts[op] = OPERATIONS[op].run(params, files or {}, self.arrays)
+        self.steps.append(step)
+        self.arrays |= arrays
+        return self.facts[op]
+
+    @property
+    def read(self) -> Facts:
+        """What the reader of the scan said about it."""
+        return next(self.facts[op] for op in READERS if op in self.facts)
+
+    @property
+    def scales(self) -> Facts:
+        """The scales of the microscope; empty without standards."""
+        return self.facts.get("calibrate", {})
+
+    @property
+    def pitch_um(self) -> list[float]:
+        """The stated (y, x) pitch of the scan times the scales of its axes, if they are known."""
+        axes = zip("yx", self.read["pitch_um"], strict=True)
+        return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
+
+    def piece(self, **said: Any) -> Piece:
+        """The piece of the store that these steps made, with further facts for its record."""
+        steps = [step.to_record() for step in self.steps]
+        record = {**said, "steps": steps, "software": software_record()}
+        return Piece(json.loads(json.dumps(record)), self.arrays)
