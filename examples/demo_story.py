@@ -15,7 +15,7 @@ from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.reports.parts import BRIGHTEST
+from litho_design.reports.pictures import BRIGHTEST
 from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
 from litho_models.evaluation.wording import benchmark_verdict

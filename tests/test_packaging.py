@@ -17,7 +17,7 @@ import litho_data
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-EXTRA_MODULES = ("torch", "skimage", "safetensors", "lightning")
+EXTRA_MODULES = ("torch", "skimage", "safetensors")
 
 WITHOUT_EXTRAS = f"""
 import importlib.abc, sys
@@ -93,7 +93,7 @@ def test_versions_and_names_agree() -> None:
     assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
     assert litho_data.__version__ == PROJECT["version"]
     core = " ".join(PROJECT["dependencies"])
-    assert not [name for name in ("torch", "lightning", "safetensors") if f"{name}>" in core]
+    assert not [name for name in ("torch", "safetensors") if f"{name}>" in core]
 
 
 def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ import pytest
 
 from litho_data.foundation.results import Record
 from litho_data.reports.page import Page
-from litho_design.reports.parts import level_table
+from litho_design.reports.tables import level_table
 from litho_models.evaluation.plots import error_bars
 from litho_models.evaluation.results import Benchmark
-from litho_models.evaluation.wording import benchmark_verdict, said
+from litho_models.evaluation.wording import benchmark_verdict
 from tests.tables import require_tables_equal_record
 
 PUBLISHED = Path(__file__).parents[1] / "docs" / "results" / "neural-lithography"
@@ -94,9 +94,6 @@ def test_the_best_model_is_that_of_the_smallest_error_in_whatever_order_they_are
         verdict = benchmark_verdict(record.model_copy(update={"scores": scores}))
         assert verdict.startswith(f"{best.model} is best")
         assert f"{second.model} is next with {second.mae_datum_free_nm:.2f} nm" in verdict
-        note = " ".join(said("notes", scores=scores))
-        assert f"left by {best.model}: {best.row_offset_sd_nm:.1f} nm along the rows" in note
-        assert f"{best.scan_line_offset_sd_nm:.1f} nm along the scan's own lines" in note
 
 
 @pytest.mark.pictures

@@ -217,9 +217,10 @@ def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
     )
 
 
-@_form("lee-side-loss", "surface", "µm", 2.0)
+@_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: np.random.Generator) -> Law:
     """Height lost per slope on the flanks that fall in one direction; other flanks lose nothing."""
+    # It is half a loss on both flanks and half a displacement, which registration takes out.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)

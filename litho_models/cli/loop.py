@@ -111,10 +111,6 @@ def check(
         list[str] | None,
         option("a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
-    residuals: Annotated[
-        list[Path] | None,
-        option("folder of `benchmark` on the reference prints, for errors on prints that no fit had seen"),
-    ] = None,
     false_alarms: Annotated[float, option("share of unchanged data sets that raise an alarm")] = 0.005,
     tolerance: Annotated[
         float | None,
@@ -134,7 +130,6 @@ def check(
         out,
         reference=reference,
         new=new or (),
-        residuals=residuals or (),
         false_alarms=false_alarms,
         tolerance=tolerance,
     )

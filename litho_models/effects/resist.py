@@ -165,7 +165,7 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
     {
         "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
         "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
-        "exponent": Parameter("1", 0.7, 3.0, 2.0, "shape"),
+        "exponent": Parameter("1", 0.7, 4.0, 2.0, "shape"),
         "turn_deg": Parameter("deg", -45.0, 45.0, 0.0, "shape"),
     },
     role="undetermined",
@@ -175,16 +175,19 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
         for turn in (0.0, 45.0)
         for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
     ),
-    source="empirical: loss along a power of the slope, one coefficient per axis of a turned frame",
+    source="empirical: loss along a power of the slope, an ellipse of coefficients in a turned frame",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - cx |dH/dx'|^p - cy |dH/dy'|^p: height missing on slopes, by axis; x' and y' are turned.
+    """H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2): height missing on slopes, by turned axes x', y'.
 
-    p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
+    With cx = cy = c it is c |grad H|^p, whichever way the slope faces; p = 1 sets each edge back by about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)
-    along_x = rounded_power((turn.cos() * x + turn.sin() * y) ** 2, power)
-    along_y = rounded_power((turn.cos() * y - turn.sin() * x) ** 2, power)
-    return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y
+    along_x, along_y = turn.cos() * x + turn.sin() * y, turn.cos() * y - turn.sin() * x
+    whole = values["along_x_um"] + values["along_y_um"]
+    share_x, share_y = (
+        (values[axis] / whole.clamp(min=1e-12)) ** (2 / power) for axis in ("along_x_um", "along_y_um")
+    )
+    return height - whole * rounded_power(share_x * along_x**2 + share_y * along_y**2, power)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.fit_cache import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen.files import load_frozen
@@ -19,7 +19,6 @@ from litho_models.frozen.on_store import (
     predict_frozen,
     trained_ids,
 )
-from litho_models.prediction.cost import measured_predictions
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import stated_floor
@@ -85,10 +84,9 @@ def evaluate(
             raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
         ids = [scan.id for scan in scans]
         learned = card_background(frozen, scans) if background == "training" else None
-        heights, cost = measured_predictions(
-            lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen)
-        )
-        predictions = [Prediction.beside(learned, height) for height in heights]
+        predictions = [
+            Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in progress(scans, "predicting")
+        ]
         protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
         result = Evaluation(
             run=run_info([protocol.seed], len(scans)),
@@ -98,8 +96,6 @@ def evaluate(
                 sha256=frozen.sha256,
                 extrapolated=extrapolate,
                 parameters=frozen.card["parameters"],
-                tiles=tile_consistency(frozen.simulator, scans[0]),
-                cost=cost,
             ),
             split=ScoredSplit(
                 kind="given",

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.results import Record
@@ -18,8 +18,7 @@ from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.models import build_model
-from litho_models.prediction.cost import PredictionCost, measured_predictions
-from litho_models.prediction.tiles import TileDifference, predict_scan, tile_difference
+from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scan_terms.measurement import MeasurementModel
@@ -38,13 +37,14 @@ class FitDiagnostics(Record):
     ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
     """
 
+    # Older results also say what a prediction cost, and how it changes in another crop.
+    model_config = ConfigDict(extra="ignore")
+
     background: Background
     measurement: MeasurementModel | None = None
     training_nm: float
     inner_validation_nm: float | None
     held_out_nm: float
-    tiles: TileDifference | None
-    cost: PredictionCost
 
 
 def diagnose(
@@ -62,7 +62,7 @@ def diagnose(
         held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
         measured: also learn the measurement model from the model's residuals.
     """
-    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
+    heights = [predict_scan(model, scan) for scan in progress(scans, "predicting")]
 
     def error_nm(chose: bool) -> float:
         own = [one for one in zip(scans, heights, strict=True) if (one[0].id in validation_ids) == chose]
@@ -74,30 +74,7 @@ def diagnose(
         training_nm=error_nm(False),
         inner_validation_nm=error_nm(True) if validation_ids else None,
         held_out_nm=mean_error_nm(held_out, held_out_um),
-        tiles=tile_consistency(model, held_out[0]),
-        cost=cost,
     )
-
-
-def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileDifference | None:
-    """Difference of predictions in a scan's field and in a crop of it without a third of rows and columns.
-
-    Pixels closer to the crop's edge than the receptive radius, or than one tile for a model on tiles, are
-    not compared. None for fields too small to leave any pixel, and for models followed by effects.
-    """
-    if not isinstance(model, Simulator):
-        return None
-    border = model.tile.size_px if model.tile is not None else model.reach_px or 0
-    offset = scan.shape[0] // 3, scan.shape[1] // 3
-    if any(length - cut <= 2 * border for length, cut in zip(scan.shape, offset, strict=True)):
-        return None
-    layout = torch.from_numpy(scan.layout_um)[None, None].to(device_of(model))
-    return tile_difference(model, layout, offset, border)
-
-
-def device_of(model: torch.nn.Module) -> str:
-    """The device of a model's weights, as torch names it."""
-    return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
 
 
 _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"

@@ -14,8 +14,6 @@ from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
 from litho_models.evaluation.fit_cache import FitRecord
-from litho_models.prediction.cost import PredictionCost
-from litho_models.prediction.tiles import TileDifference
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, Paired, paired_scores
@@ -26,14 +24,12 @@ if TYPE_CHECKING:
 
 
 class ModelRecord(Record):
-    """The frozen model that was scored, and what its predictions cost."""
+    """The frozen model that was scored."""
 
     name: str
     sha256: str
     extrapolated: bool
     parameters: int | None = None
-    tiles: TileDifference | None = None
-    cost: PredictionCost | None = None
 
 
 class Evaluation(Result):

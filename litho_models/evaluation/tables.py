@@ -109,12 +109,6 @@ def metric_table(scores: Sequence[ModelScores]) -> Rows:
     ]
 
 
-def band_table(scores: Sequence[ModelScores]) -> Rows:
-    """One row per model: how far up in frequency the prediction follows the measurement, along x and y."""
-    names = [f"{figure}_{axis}_per_um" for figure in ("half_power", "noise_band") for axis in "xy"]
-    return [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
-
-
 def scan_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model and scan."""
     return [

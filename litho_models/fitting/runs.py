@@ -1,8 +1,6 @@
 """Run folders: train a model on a store, resumable."""
 
-import os
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -87,11 +85,8 @@ def train(
         "config": config.model_dump(mode="json"),
         "lock_box": locked,
     }
-    # Under torchrun only the first process writes.
-    first = int(os.environ.get("RANK", "0")) == 0
-    with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
-        if first:
-            say(f"training {model} on {len(used)} scans")
+    with growing_folder(folder, TrainingRun.FILE_NAME, facts):
+        say(f"training {model} on {len(used)} scans")
         fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
         record = TrainingRun(
             run=run_info([config.seed], len(used)),
@@ -103,8 +98,6 @@ def train(
             at_bounds=fitted.model.at_bounds,
             **facts,
         )
-        if not first:
-            return record
         heights = [predict_scan(fitted.model, scan) for scan in used]
         save_frozen(
             fitted.model,

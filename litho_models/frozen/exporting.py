@@ -7,11 +7,10 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from litho_data.foundation.errors import InputError
@@ -52,7 +51,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
     generator = torch.Generator().manual_seed(0)
     lowest, highest = model.card["calibrated_range_um"]
     layouts = lowest + (highest - lowest) * torch.rand((2, 1, 1, *shape), generator=generator)
-    simulator = _in_plain_operations(model.simulator)
+    simulator = copy.deepcopy(model.simulator).float().cpu()
     with torch.no_grad():
         wanted = simulator(layouts[1])
         program = _program(simulator, layouts)
@@ -65,27 +64,6 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
                 got = f"a print that differs by {difference:g} µm"
                 raise InputError(f"export of {model.name}", got=got, wanted=f"{LARGEST_DIFFERENCE_UM:g} µm")
     return difference
-
-
-def _in_plain_operations(simulator: nn.Module) -> nn.Module:
-    """A copy whose networks run layer by layer: a program cannot contain the compiled stack."""
-    plain = copy.deepcopy(simulator).float().cpu().eval().requires_grad_(False)
-    for module in plain.modules():
-        activation = getattr(module, "activation", None)
-        if isinstance(activation, nn.LeakyReLU):
-            cast(Any, module).activation = _LeakySteps(activation.negative_slope)
-    return plain
-
-
-class _LeakySteps(nn.Module):
-    """A leaky ReLU that no fast path recognises."""
-
-    def __init__(self, slope: float):
-        super().__init__()
-        self.slope = slope
-
-    def forward(self, values: Tensor) -> Tensor:
-        return functional.leaky_relu(values, self.slope)
 
 
 class _Numbers(TorchDispatchMode):

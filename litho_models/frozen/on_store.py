@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from litho_data.level.scan import write_heights
 from litho_data.readers.exported import export_of
@@ -35,10 +34,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
     """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
-    device = next((p.device for p in model.parameters()), torch.device("cpu"))
-    with torch.no_grad():
-        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
-        return model(layout, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um)[0, 0].cpu().numpy()
+    model.check_geometry(scan.pitch_um, scan.level_height_um)
+    return model.predict(scan.layout_um)
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:

@@ -5,7 +5,6 @@ thousand pixels this is faster than a Fourier transform, and no period or paddin
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -24,19 +23,20 @@ _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
+Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
 # Radius of a kernel: four sigma, or three times sigma cut to whole pixels (the authors' code).
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
 def gaussian_blur(
     field: Tensor,
-    sigma_um: float | Tensor | tuple[float | Tensor, float | Tensor],
+    sigma_um: Sigma,
     pitch_um: float,
     *,
-    edge: Edge = "replicate",
-    radius_px: int | None = None,
+    edge: Edge | None = "replicate",
+    radius_px: int | tuple[int, int] | None = None,
 ) -> Tensor:
-    """Blur ``field`` (..., y, x) to the same size with a Gaussian of standard deviation ``sigma_um``.
+    """Blur ``field`` (..., y, x) with a Gaussian of standard deviation ``sigma_um``.
 
     g(d) ∝ exp(-d²/2σ²), normalised over its support of at least 4σ on each side.
 
@@ -45,42 +45,28 @@ def gaussian_blur(
         sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. Tensors
             carry gradients.
         pitch_um: sampling of the field, µm.
-        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
-        radius_px: reach of the kernel to each side; four sigma by default.
+        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside; the size stays the
+            same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).
+        radius_px: reach r of the kernel to each side, or a pair; four sigma by default.
 
     Raises:
-        InputError: a pitch that is not positive, or a field without pixels.
+        InputError: a pitch that is not positive, or a field without pixels or narrower than the support.
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
-    pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
-    sigmas = [torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um for sigma in pair]
-    radii = [kernel_radius_px(float(sigma.detach())) if radius_px is None else radius_px for sigma in sigmas]
-    return _blur(field, sigmas, radii, edge)
-
-
-def blur_interior(
-    field: Tensor, sigma_px: Tensor | tuple[Tensor, Tensor], radius_px: int | tuple[int, int]
-) -> Tensor:
-    """Blur and keep only the pixels whose whole support lies inside: (..., y - 2r, x - 2r).
-
-    Raises:
-        InputError: a field narrower than the support, or without pixels.
-    """
-    sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
-    radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
-    return _blur(field, sigmas, radii, None)
-
-
-def _blur(field: Tensor, sigmas: Sequence[Tensor], radii: Sequence[int], edge: Edge | None) -> Tensor:
-    """Along x, then along y; continued beyond the edge, or the interior alone."""
     if not field.numel():
         raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
+    widths = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
     # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
+        # Along x, then along y.
         for axis in (-1, -2):
+            sigma_px = torch.as_tensor(widths[axis], dtype=field.dtype, device=field.device) / pitch_um
             radius = radii[axis]
+            if radius is None:
+                radius = kernel_radius_px(float(sigma_px.detach()))
             if edge is not None:
                 field = pad_field(field, *((radius, 0) if axis == -2 else (0, radius)), edge)
             *samples, rows, columns = field.shape
@@ -89,7 +75,7 @@ def _blur(field: Tensor, sigmas: Sequence[Tensor], radii: Sequence[int], edge: E
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
             # Along x all lines of all samples are one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
-            blurred = _Blur.apply(images, _band(radius, sigmas[axis].to(field.dtype)), axis)
+            blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
         return field
 

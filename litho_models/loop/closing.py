@@ -1,5 +1,7 @@
 """Close the loop on a set of scans: from the residual of a base to causes, laws and what is left.
 
+Bases compete by what they explain together with causes: causes are sought beside each of them.
+
 ``close`` is an estimator: it chooses and fits on the scans that it is given, and what it returns predicts any
 other scan. Whatever is judged on scans is chosen without them by calling it on the rest.
 """
@@ -12,11 +14,11 @@ from functools import cache
 
 from torch import nn
 
-from litho_models.effects import Effect, screened_effects
+from litho_models.effects import screened_effects
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import judge
+from litho_models.loop.judging import SMALLEST_SHARE, judge
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
@@ -31,7 +33,7 @@ class Closed:
     """What was chosen and fitted on some scans.
 
     Attributes:
-        base_name: of the base with the smallest error; ``others``: those that lost against it.
+        base_name: of the base that was taken; ``rivals``: what the same search found beside the others.
         plain: the base fitted to the scans as they are; ``base``: to scans freed of what a group shares.
         named: among causes; ``lawful``: among short laws beside them.
         described: tables over a covariate, which say where the rest lies; the model has them last.
@@ -40,7 +42,7 @@ class Closed:
     """
 
     base_name: str
-    others: Mapping[str, nn.Module]
+    rivals: Mapping[str, Found]
     plain: State
     base: State
     named: Found
@@ -74,37 +76,56 @@ class Closed:
         """All that is reported."""
         return [*self.traced, *self.described.causes]
 
+    def survives_on(self, cause: Cause) -> list[str]:
+        """The other bases beside which the search found the same cause, or one of its set."""
+        alike = {cause.name, *cause.alike}
+        return [
+            name
+            for name, rival in self.rivals.items()
+            if any(alike & {one.name, *one.alike} for one in rival.causes)
+        ]
+
+    def needed_by_all(self, cause: Cause) -> bool:
+        """Whether every other base lacks the cause too; one with more numbers may have taken it up."""
+        base, survives_on = self.plain.twin.own, self.survives_on(cause)
+        others = {name for name, rival in self.rivals.items() if rival.state.twin.own <= base}
+        return others <= {*survives_on}
+
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     """Find what a base lacks on these scans.
 
     Args:
         study: development scans.
-        bases: simulators by name, those with few parameters refitted, others taken as they are: the one with
-            the smallest error on held-out scans is corrected.
+        bases: simulators by name, those with few parameters refitted, others taken as they are.
     """
-    fits = {}
+    plain = {}
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
-        fits[name] = fit_state(Twin.bare(base), study)
-    best = min(fits, key=lambda name: fits[name].mse_nm2)
-    plain = fits[best]
+        plain[name] = fit_state(Twin.bare(base), study)
     study.report("learning what scans of a group share")
-    freed = replace(study, scans=prepare_scans(freed_scans(plain)))
-    start = fit_state(plain.twin, freed)
-    learner = Learner(freed, start.maps_um(freed.scans))
-
-    @cache
-    def rest(state: State) -> Rest:
-        return learner.rest(state.maps_um(freed.scans))
-
+    nearest = min(plain.values(), key=lambda state: state.mse_nm2)
+    freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
     excluded = untestable(freed)
     candidates = [
         one
         for one in screened_effects(freed.tip_radius_um)
         if one.name not in excluded and one.of_films == freed.of_films
     ]
-    named, lawful, described = _searched(start, candidates, rest)
+    starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
+    searches = {}
+    for name, state in starts.items():
+        study.report(f"looking for what {name} lacks")
+        searches[name] = search(state, candidates)
+    chosen = _simplest(searches)
+    start, named = starts[chosen], searches.pop(chosen)
+    learner = Learner(freed, start.maps_um(freed.scans))
+
+    @cache
+    def rest(state: State) -> Rest:
+        return learner.rest(state.maps_um(freed.scans))
+
+    lawful, described = _checked(start, named, rest)
     stages: dict[State, str] = {}
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
@@ -112,9 +133,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         # By the model, so that a stage that changes nothing counts with the one before it.
         stages.setdefault(state, name)
     return Closed(
-        base_name=best,
-        others={name: base for name, base in bases.items() if name != best},
-        plain=plain,
+        base_name=chosen,
+        rivals=searches,
+        plain=plain[chosen],
         base=start,
         named=named,
         lawful=lawful,
@@ -124,21 +145,32 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     )
 
 
-def _searched(
-    start: State, candidates: Sequence[Effect], rest: Callable[[State], Rest]
-) -> tuple[Found, Found, Found]:
-    """Causes, laws beside them, and tables beside both; each cause is checked with everything else in place.
+def _simplest(searches: Mapping[str, Found]) -> str:
+    """The base that needs the fewest numbers, causes included, of those that do as well as the best."""
+    best_nm2 = min(found.state.mse_nm2 for found in searches.values())
+    close = {
+        name: len(found.state.twin.vector)
+        for name, found in searches.items()
+        if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
+    }
+    return min(close, key=lambda name: close[name])
+
+
+def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
+    """Laws beside the causes, and tables beside both; each cause is checked with everything else in place.
 
     One that fails is taken out, and laws are sought anew without it.
+
+    Args:
+        start: the base; ``named``: its causes, of which those remain whose names stand.
     """
-    study, named = start.study, search(start, candidates)
+    study = start.study
     # Laws and tables are of heights.
     laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("looking for a law in what is left")
-        # Two terms at most, so that a law is a short formula.
-        lawful = search(named.state, laws, 2, secants)
+        lawful = search(named.state, laws, 4, secants)
         study.report("describing what is left")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
@@ -150,7 +182,7 @@ def _searched(
                 named.causes = [check.beside_table(check.beside_laws(one)) for one in named.causes]
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
-            return named, lawful, _in_model(lawful.state, described)
+            return lawful, _in_model(lawful.state, described)
         # What may only correct another formula goes first: that formula is then judged without it.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")

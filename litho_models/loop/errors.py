@@ -12,15 +12,13 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import State, fit_state
-from litho_models.loop.judging import judge
+from litho_models.loop.fits import State
 from litho_models.loop.measured import Fit, fit_with_measurement
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import Blocks, Policy
 from litho_models.scan_terms.background import learn_background
-from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.shapes import edges_of_scan
@@ -146,20 +144,6 @@ class HeldOut:
             (scan.id, left_nm(scan, before), left_nm(scan, after))
             for scan, before, after in zip(self.scans, *maps, strict=True)
         ]
-
-    def survives_on(self) -> dict[str, list[str]]:
-        """For each cause and law, the other bases on which it is confirmed too, all others in place."""
-        final, study = self.closed.final.twin, self.closed.study
-        found: dict[str, list[str]] = {name: [] for name in final.names}
-        for base_name, base in self.closed.others.items() if found else ():
-            study.report(f"trying what was found on {base_name}")
-            bare = fit_state(Twin.bare(base), study)
-            full = fit_state(final.over(bare.twin.fitted_base), study)
-            for name, one in final.effects.items():
-                judgement = judge(full.without(name).freed_nm2, full.freed_nm2, study)
-                if judgement.passed(grouped=one.by != ALL):
-                    found[name].append(base_name)
-        return found
 
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
         terms = {"measurement": "shared", "held_out": "scans", **terms}

@@ -97,7 +97,7 @@ class FoundEffect(Record):
         left_out_nm: by how much the mean absolute error grows when it is left out (k = 1).
         family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
         reshaped_share: what its change in other shapes would take beside it, of its own gain.
-        survives_on: bases on which it is confirmed as well.
+        survives_on: other bases beside which the search found it as well.
     """
 
     name: str

@@ -41,17 +41,16 @@ def record(
     *,
     single_scans: list[ScanFinding],
     left_out_nm: Mapping[str, float],
-    survives_on: Mapping[str, list[str]],
     **given: Any,
 ) -> CloseLoop:
     """The record of one run.
 
     Args:
         closed: what was found; ``errors``: of ``error_rows``; ``single_scans``: what those add.
-        left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
+        left_out_nm: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
     """
     study, final = closed.study, closed.final.twin
-    effects = [_found(closed, one, left_out_nm[one.name], survives_on[one.name]) for one in closed.found]
+    effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
     before, after = (
         next(row.leading_by_scan_nm for row in errors if row.is_headline and row.model == model)
         for model in ("base", "all")
@@ -113,12 +112,12 @@ def _values(twin: Twin) -> dict[str, float]:
     return found
 
 
-def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[str]) -> FoundEffect:
+def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
     # What another base does not need corrects the form of this one.
-    corrects = effect.knowledge == "cause" and not {*closed.others} <= {*survives_on}
+    corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
         name=cause.name,
@@ -139,7 +138,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[s
         group_p=cause.group_p,
         reshaped_share=cause.reshaped_share,
         left_out_nm=left_out_nm,
-        survives_on=survives_on,
+        survives_on=closed.survives_on(cause),
     )
 
 

@@ -104,7 +104,7 @@ def close_loop(
             return close(study.of_others(scans), own)
 
         models = HeldOut(closed)
-        errors, left_out_nm, survives_on = models.errors(), models.left_out_nm(), models.survives_on()
+        errors, left_out_nm = models.errors(), models.left_out_nm()
         planted = [plant(*one, closed, close_again) for one in wanted]
         often: dict[str, int] = {}
         if nested:
@@ -124,7 +124,6 @@ def close_loop(
             errors,
             single_scans=alone,
             left_out_nm=left_out_nm,
-            survives_on=survives_on,
             run=run_info([seed], len(development), dropped),
             dataset=opened.dataset_id,
             measurement=models.fit(closed.final).measurement,

@@ -62,7 +62,8 @@ class Screened:
 
     @property
     def numbers(self) -> int:
-        return len(self.trial.sets) * len(self.multiples)
+        shapes = sum(facts.kind == "shape" for facts in self.trial.effect.parameters.values())
+        return len(self.trial.sets) * len(self.multiples) + shapes
 
     def start(self) -> dict[str, dict[str, float]]:
         """Values by label from which a fit begins."""

@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
@@ -77,7 +77,7 @@ class BlurTable(Simulator):
         return kernel_radius_px(float(self.sigma_um.detach()) / self.pitch_um)
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        dose = blur_interior(layout_um, self.sigma_um / self.pitch_um, self.reach_px)
+        dose = gaussian_blur(layout_um, self.sigma_um, self.pitch_um, edge=None, radius_px=self.reach_px)
         return interpolate(dose, self.table_um, 0.0, self.config.full_height_um)
 
 
@@ -124,8 +124,7 @@ def blurred_interior(
         slice(reach_px - radius, length - reach_px + radius)
         for radius, length in zip(radii, layout_um.shape[-2:], strict=True)
     )
-    y, x = (torch.tensor(sigma / pitch_um, device=layout_um.device) for sigma in pair)
-    return blur_interior(layout_um[..., rows, columns], (y, x), radii)
+    return gaussian_blur(layout_um[..., rows, columns], pair, pitch_um, edge=None, radius_px=radii)
 
 
 class LinearConfig(SimulatorConfig):

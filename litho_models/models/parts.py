@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError, require_known
-from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
 from litho_models.simulator import crop_border
@@ -90,9 +90,8 @@ def illuminate(
     total = torch.zeros(())
     for share, sigma_um in spots:
         radius = spot_radius_px(sigma_um, pitch_um)
-        total = total + share * blur_interior(
-            crop_border(pattern, reach_px - radius), sigma_um / pitch_um, radius
-        )
+        seen = crop_border(pattern, reach_px - radius)
+        total = total + share * gaussian_blur(seen, sigma_um, pitch_um, edge=None, radius_px=radius)
     return total
 
 
@@ -145,7 +144,8 @@ def _by_spots(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
 
 def _diffuse(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
     sigma_um = values["sigma_um"]
-    return blur_interior(resist, sigma_um / pitch_um, spot_radius_px(sigma_um, pitch_um))
+    radius = spot_radius_px(sigma_um, pitch_um)
+    return gaussian_blur(resist, sigma_um, pitch_um, edge=None, radius_px=radius)
 
 
 def _optics(values: Values) -> Optics:

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
+from litho_models.layers.gaussian import Edge, Sigma, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
@@ -175,29 +175,23 @@ class Pbl(Simulator):
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
         """What the chain makes of the interior, and the fields whose features each network sees, µm."""
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
-        printed = self._chain_interior(crop_border(layout_um, self.reach_px - self._chain_px - along))
+        printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
         around = self.surroundings
         layouts = [] if around is None else [crop_border(layout_um, self.reach_px - around.reach_px)]
         return crop_border(printed, along), layouts if self.scan_axis is None else [*layouts, printed]
 
-    def _chain_interior(self, layout_um: Tensor) -> Tensor:
-        optical, diffusion = self._radii_px()
-        initial = self._threshold(self._blur(layout_um, self._sigma_optical(layout_um), optical))
-        dose = self._blur(initial, self.sigma_diffusion_um, diffusion)
-        return self._develop(crop_border(initial, diffusion), dose)
-
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        if self.config.edge == "replicate":
-            return super().forward(layout_um)
-        optical, diffusion = self._radii_px()
-        padded = pad_field(layout_um, optical, optical, "zero")
-        initial = self._threshold(self._blur(padded, self._sigma_optical(layout_um), optical))
-        padded = pad_field(initial, diffusion, diffusion, "zero")
-        return self._develop(initial, self._blur(padded, self.sigma_diffusion_um, diffusion), padding=1)
+        return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
-    def _sigma_optical(self, layout_um: Tensor) -> Tensor:
-        return torch.tensor(self.config.sigma_optical_um, device=layout_um.device)
+    def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
+        """What the paper's chain makes of a field with nothing beyond its edge, or of its interior alone."""
+        optical, diffusion = self._radii_px()
+        initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
+        dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
+        if edge is None:
+            return self._develop(crop_border(initial, diffusion), dose)
+        return self._develop(initial, dose, padding=1)
 
     def _radii_px(self) -> tuple[int, int]:
         config, diffusion = self.config, float(self.sigma_diffusion_um.detach())
@@ -207,8 +201,8 @@ class Pbl(Simulator):
         )
         return optical, diffused
 
-    def _blur(self, field: Tensor, sigma_um: Tensor, radius_px: int) -> Tensor:
-        return blur_interior(field, sigma_um / self.pitch_um, radius_px)
+    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
+        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um

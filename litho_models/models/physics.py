@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from litho_models.layers.gaussian import (
     Edge,
+    Sigma,
     Support,
-    blur_interior,
     gaussian_blur,
     pad_field,
     supported_radius_px,
@@ -146,28 +146,26 @@ class Physics(Simulator):
         return self.config.reference_height_um or self.config.full_height_um
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        values = self.values
-        optical, diffusion = self._radii_px(values)
-        along_y, along_x = (
-            torch.as_tensor(sigma / self.pitch_um, device=layout_um.device) for sigma in self._spot_um(values)
-        )
-        aerial = blur_interior(layout_um / self._reference_um, (along_y, along_x), optical)
-        initial = self._project(aerial, values)
-        dose = blur_interior(initial, values["sigma_diffusion_um"] / self.pitch_um, diffusion)
-        return self._develop(crop_border(initial, diffusion), dose, values)
+        return self._printed(layout_um, None)
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        edge, values = self.config.edge, self.values
+        return self._printed(layout_um, self.config.edge)
+
+    def _printed(self, layout_um: Tensor, edge: Edge | None) -> Tensor:
+        """Height of the field with what lies beyond its edge, or of its interior alone."""
+        values = self.values
         optical, diffusion = self._radii_px(values)
         # A continued layout, blurred, is itself continued from the radius of the optical blur on.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
-        spot, sigma_diffusion = self._spot_um(values), values["sigma_diffusion_um"]
-        aerial = gaussian_blur(relative, spot, self.pitch_um, edge=edge, radius_px=optical)
-        initial = self._project(aerial, values)
-        dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
-        return self._develop(crop_border(initial, margin), crop_border(dose, margin), values)
+        initial = self._project(self._blur(relative, self._spot_um(values), optical, edge), values)
+        dose = self._blur(initial, values["sigma_diffusion_um"], diffusion, edge)
+        initial = crop_border(initial, margin if edge else diffusion)
+        return self._develop(initial, crop_border(dose, margin), values)
+
+    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
+        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     # The methods below take the values, computed once per pass: in forward mode every operation is slow.
 

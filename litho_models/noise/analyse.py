@@ -1,6 +1,5 @@
 """``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.begun import growing_folder
@@ -27,7 +26,7 @@ def analyse_noise(
     store: str | Path,
     out: str | Path,
     *,
-    residuals: Sequence[str | Path] = (),
+    residuals: str | Path | None = None,
     model: str | None = None,
     seed: int = 0,
 ) -> NoiseAnalysis:
@@ -36,16 +35,15 @@ def analyse_noise(
     Args:
         store: dataset store, with or without scans of use substrate, flat and steps, with or without doses.
         out: result folder.
-        residuals: folders of ``litho-models benchmark`` (out of fold), or frozen models (folders,
-            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold;
-            several of one kind are taken as an ensemble.
-        model: which model of the benchmarks; their best one by default.
+        residuals: folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
+            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold.
+        model: which model of the benchmark; its best one by default.
         seed: decides which pixels are drawn.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.
     """
-    if model is not None and not residuals:
+    if model is not None and residuals is None:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
@@ -53,7 +51,7 @@ def analyse_noise(
         locked = dataset.locked_ids
         scans = [scan for scan in every if scan.id not in locked]
         references = store_references(dataset)
-        spread = read_residuals(dataset, residuals, model) if residuals else None
+        spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
         # A dose often has one print only, and the matrix judges no model: so it uses locked scans too.

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.noise.staircase import READABLE_AT, pooled_sd
+from litho_models.noise.staircase import READABLE_AT
 
 # Distance from every change of level: four σ of the optical spot, two of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
@@ -156,7 +156,7 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     for level_number, parts in sorted(found.items()):
         heights = np.concatenate(parts)
         if heights.size >= _FEWEST_PIXELS:
-            rows.append((level_number, float(heights.mean()), pooled_sd(parts), int(heights.size)))
+            rows.append((level_number, float(heights.mean()), _pooled_sd(parts), heights.size))
     ground = rows[0][1] if rows else 0.0
     return [
         LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
@@ -185,3 +185,9 @@ def _plateaus(scan: PrintedScan) -> np.ndarray:
 def _run_length(flags: np.ndarray) -> int:
     """Number of leading True values."""
     return int(np.argmin(flags)) if not flags.all() else len(flags)
+
+
+def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
+    """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

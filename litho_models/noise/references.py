@@ -15,7 +15,6 @@ from litho_models.noise.surface import (
     BACKGROUNDS,
     PrintNoise,
     SurfaceNoise,
-    pooled,
     print_noise,
     surface_noise,
     without_background,
@@ -79,7 +78,7 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
     substrates, flats = surfaces("substrate"), surfaces("flat")
     alone = [
-        print_noise(flat, pooled([s for s in substrates if s.background == flat.background]))
+        print_noise(flat, [one for one in substrates if one.background == flat.background])
         for flat in flats
         if substrates
     ]

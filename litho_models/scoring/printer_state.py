@@ -63,14 +63,14 @@ def scan_figures(
         for part in (scan.height_um, prediction_um)
     )
     line = print_gain(height, expected, used, block_px=blocks.block_px)
-    if np.ptp(scan.mask_level) == 0 or not np.isfinite(line.slope):
+    if np.ptp(scan.mask_level) == 0 or line.slope is None:
         return None
     return ScanFigures(
         scan=scan.id,
         print=scan.print_id,
         order=scan.order,
         gain=line.slope,
-        gain_error=line.slope_error if np.isfinite(line.slope_error) else None,
+        gain_error=line.slope_error,
         error_nm=NM_PER_UM * float(np.abs(residual[used]).mean()),
         pixels=int(used.sum()),
         relief_nm=NM_PER_UM * float(expected[used].std()),

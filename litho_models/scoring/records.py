@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -80,9 +80,12 @@ class ScanErrors(Record):
     """Error of one model on one scan over the scored pixels.
 
     ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are freed of
-    terms fitted on other pixels. Slope and intercept, the gain and offset of the print against the
-    prediction, have standard errors and a correlation (``print_gain``); None where they cannot be known.
+    terms fitted on other pixels. Slope and intercept are the gain and offset of the print against the
+    prediction (``print_gain``).
     """
+
+    # Older results also have the error of the intercept.
+    model_config = ConfigDict(extra="ignore")
 
     pixels: int
     mae_abs_nm: float
@@ -94,8 +97,6 @@ class ScanErrors(Record):
     slope: float | None
     intercept_nm: float
     slope_error: float | None = None
-    intercept_error_nm: float | None = None
-    slope_intercept_correlation: float | None = None
 
 
 class ScanRow(MetricValues, ScanErrors):
@@ -113,6 +114,9 @@ class ModelScores(MetricValues):
     ``phase_rms_waves`` is the RMS error seen by light that passes the print.
     """
 
+    # Older results also have the spread of line offsets.
+    model_config = ConfigDict(extra="ignore")
+
     model: str
     scans: list[ScanRow]
     seen_by: Instrument = "afm"
@@ -129,8 +133,6 @@ class ModelScores(MetricValues):
     phase_rms_waves: float | None = None
     by_level: list[LevelError]
     transfer: TransferCurves
-    row_offset_sd_nm: float
-    scan_line_offset_sd_nm: float
     dropped_pixels: int
     constant_predictions: int
 
