@@ -142,13 +142,7 @@ settings = litho_design.hologram_settings(changes=small)
 litho_design.design_hologram("text", "zoo:physics", "hologram", settings=settings, judges=())
 design = litho_design.load_design("hologram")
 printed_um = design.printed_um(litho_design.load_printer("zoo:physics", settings.layout))
-show(
-    {
-        "layout, levels": design.level,
-        "print, µm": printed_um,
-        "image": design.display(design.image(printed_um)),
-    }
-)
+show({"levels": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
 
 # %% [markdown]
 # ## 11. A lens [in a program of your own](../element.md): a focus at 20 µm, from the wave behind its print
