@@ -94,12 +94,14 @@ def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
     figure = new_figure(11, 5.5)
     changes = [NM_PER_UM * (own - maps[0] - (own - maps[0]).mean()) for own in maps]
     reach = np.percentile(np.abs(changes[1:]), 99)
+    lowest, highest = np.min(maps), np.max(maps)
     axes = figure.subplots(2, len(maps), squeeze=False)
     for column, (rival, own, change) in enumerate(zip(rivalry.question.rivals, maps, changes, strict=True)):
-        axes[0, column].imshow(own, cmap="viridis")
+        height = axes[0, column].imshow(own, cmap="viridis", vmin=lowest, vmax=highest)
         axes[0, column].set_title(rival.name, fontsize=9)
         picture = axes[1, column].imshow(change, cmap="RdBu_r", vmin=-reach, vmax=reach)
     for one in axes.flat:
         one.set_axis_off()
-    figure.colorbar(picture, ax=axes[1], label="nm", shrink=0.7)
+    figure.colorbar(height, ax=axes[0], label="height, µm", shrink=0.7)
+    figure.colorbar(picture, ax=axes[1], label="difference, nm", shrink=0.7)
     return figure
