@@ -1,8 +1,8 @@
-"""Models with many parameters: stochastic gradient on random crops, in rounds.
+"""Train models with many parameters by stochastic gradient on random crops, in rounds.
 
-Between rounds the scan terms are estimated anew from whole-scan predictions, the inner
-validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
-that is random is a function of seed and step, so a killed run continues to the same result.
+Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
+scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
+and step, so an interrupted run continues to the same result.
 """
 
 import math
@@ -89,7 +89,7 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Run steps up to ``last``; InputError if numbers become infinite or NaN, whatever fails then."""
+    """Run steps up to ``last``; raise InputError if numbers become infinite or NaN."""
     try:
         yield
         error = None
@@ -168,10 +168,10 @@ def _losses(
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # A pixel counts as much as it will in the blended field.
+        # Each pixel has its weight in the blended field.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
+    # A mean over all pixels, valid or not, so crops count equally in groups of any size.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 

@@ -1,4 +1,4 @@
-"""A frozen model as a program of its own, for one size of layout: ``torch.export`` or ONNX."""
+"""Export a frozen model as a stand-alone program for one size of layout, by ``torch.export`` or ONNX."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
 SUFFIXES = (".pt2", ".onnx")
-# An exported model prints what the model prints, to 0.01 nm.
+# Largest difference between an exported program and its model, 0.01 nm.
 LARGEST_DIFFERENCE_UM = 1e-5
 _ITEM = torch.ops.aten._local_scalar_dense.default
 _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um")
@@ -67,7 +67,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
 
 
 class _Numbers(TorchDispatchMode):
-    """Python numbers that a model reads from tensors: recorded in one run, replayed in another.
+    """Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
     They are the radii of kernels, which follow from widths, and the ends of tables. Both follow from the
     weights alone, so a program may hold them as constants.
