@@ -12,7 +12,7 @@ import pytest
 
 from litho_data.foundation.results import Record
 from litho_data.reports.page import Page
-from litho_design.reports.parts import level_table
+from litho_design.reports.tables import level_table
 from litho_models.evaluation.plots import error_bars, line_profiles
 from litho_models.evaluation.results import Benchmark
 from litho_models.evaluation.wording import benchmark_verdict

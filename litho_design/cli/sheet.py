@@ -9,7 +9,7 @@ import typer
 
 from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
-from litho_design.exports.formats import Format
+from litho_design.exports.job import Format
 
 sheet = typer.Typer(help="One sheet of prints: make it for a lab, and read its scans.", no_args_is_help=True)
 

@@ -107,9 +107,10 @@ class Element(nn.Module):
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
-        tile = self.tile_px
-        large = tile is not None and self.layout.size_px > tile
-        return self.printer.print_in_tiles(level, tile) if large and tile else self.printer(level)
+        if self.tile_px is None or self.layout.size_px <= self.tile_px:
+            return self.printer(level)
+        around = torch.nn.functional.pad(level, (self.printer.halo_px,) * 4)
+        return self.printer.print_in_tiles(around, self.tile_px)
 
     def levels(self) -> np.ndarray:
         """The layout to be printed, uint8 (size, size)."""

@@ -13,8 +13,8 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.run_facts import run_facts
 from litho_data.layouts.card_text import CARD_NAME
 from litho_data.reports.page import Page
+from litho_design.images.measurements import MeasuredSource
 from litho_design.judging.gap import design_folder
-from litho_design.judging.measured import MeasuredSource
 from litho_design.printers.source import Device
 from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, ReadSheet, Sheet
 from litho_design.workflows.score import score
