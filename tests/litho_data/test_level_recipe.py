@@ -147,7 +147,7 @@ def test_the_page_says_of_every_operation_whether_another_program_has_levelled_w
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
     follows = {name: row[3] for row in rows if len(row) == 4 for name in re.findall("`([^`]+)`", row[0])}
     assert STEPS.keys() == follows.keys() - {"op"}
-    at = next(i for i, row in enumerate(rows) if row[0] == "has reference fields")
+    at = next(i for i, row in enumerate(rows) if row[0] == "tested with reference fields")
     with_fields, without = (set(re.findall("`([^`]+)`", cell)) for cell in rows[at + 2])
     assert {name for name, whose in follows.items() if whose.startswith("Gwyddion")} <= with_fields | without
     assert not with_fields & without
