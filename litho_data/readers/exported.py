@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.files import read_text
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.gds_rows import GdsRows
@@ -27,7 +28,7 @@ def export_of(file: Path) -> dict[str, Any]:
     """
     path = file.with_name(f"{file.name}.json")
     try:
-        says = json.loads(path.read_text(encoding="utf-8"))
+        says = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
     if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import read_text
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
@@ -134,7 +135,7 @@ def read_scored(path: str | Path) -> ScoredResult:
 
 def _schema(file: Path) -> object:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_text(file))
     except (OSError, ValueError):
         return None
     return content.get("schema") if isinstance(content, dict) else None

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
@@ -78,7 +79,8 @@ def train_network(
             validation_mae_datum_free_nm=validation_error(model, validation),
             seconds=time.monotonic() - started,
         )
-        if not np.isfinite([record.training_mae_nm, record.validation_mae_datum_free_nm or 0]).all():
+        errors_nm = record.training_mae_nm, record.validation_mae_datum_free_nm or 0.0
+        if not HEIGHT_UM.holds([one / NM_PER_UM for one in errors_nm]):
             raise _diverged(model, last)
         state.record(record)
         if checkpoints is not None:
@@ -104,7 +106,7 @@ def _diverging(model: Simulator, last: int) -> Iterator[None]:
 def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
-        got=f"weights or errors that are not finite at step {step}",
+        got=f"weights or errors beyond all heights at step {step}",
         wanted="steps that converge",
         hint="try a smaller learning_rate",
     )
