@@ -249,7 +249,7 @@ class AreawiseNet(nn.Module):
         convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
-        self.activation: nn.Module = nn.LeakyReLU(leaky_slope, inplace=True)
+        self.leaky_slope = leaky_slope
         for convolution in convolutions:
             weight = convolution.weight
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -263,7 +263,7 @@ class AreawiseNet(nn.Module):
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
-            features = self.activation(features)
+            features = functional.leaky_relu(features, self.leaky_slope, inplace=True)
         # The sum over channels is the height, so it needs full precision even if the stack runs in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(

@@ -13,6 +13,7 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
+from litho_models.scoring.like_layouts import blurred_layout_um
 
 # Distance from every change of level: four σ of the optical spot, two of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
@@ -164,11 +165,7 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
 
 def _surroundings(scan: PrintedScan) -> np.ndarray:
     """Mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx) µm."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    blurs = [gaussian_filter(layout, reach / scan.pitch_um, mode="nearest") for reach in _REACHES_UM]
-    return np.stack(blurs) - layout
+    return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 
 
 def _plateaus(scan: PrintedScan) -> np.ndarray:

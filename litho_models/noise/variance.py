@@ -12,6 +12,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
+from litho_models.scoring.like_layouts import blurred_layout_um
 
 # Maps that σ may depend on; the slope is also taken squared, the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
@@ -75,11 +76,7 @@ def covariates_of(places: dict[str, Array]) -> Array:
 
 def layout_slope(scan: PrintedScan) -> Array:
     """Slope of the layout behind the optical spot, height over length, (ny, nx)."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    blurred = gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest")
-    return np.hypot(*np.gradient(blurred, scan.pitch_um))
+    return np.hypot(*np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM), scan.pitch_um))
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:

@@ -97,13 +97,17 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
 
 def _surroundings(scan: PrintedScan) -> Array:
     """Features of each pixel's surroundings: blurred layouts and two slopes, (k, ny·nx), µm."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    maps = [gaussian_filter(layout, sigma / scan.pitch_um, mode="nearest") for sigma in _BLURS_UM]
-    slopes = np.gradient(gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest"))
+    maps = [blurred_layout_um(scan, sigma_um) for sigma_um in _BLURS_UM]
+    slopes = np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM))
     maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
     return np.stack([field.ravel() for field in maps])
+
+
+def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
+    """The layout of a scan, blurred by a Gaussian, (ny, nx) float64; its outermost pixels are continued."""
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(scan.layout_um.astype(np.float64), sigma_um / scan.pitch_um, mode="nearest")
 
 
 def _whitened(feature: Array) -> Array:
