@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -101,5 +101,5 @@ def _chosen(store: Store, ids: Sequence[str] | None) -> list[PrintedScan]:
     return wanted
 
 
-def _tensor(field: np.ndarray, dtype: type) -> Tensor:
+def _tensor(field: np.ndarray, dtype: type[Any]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(field[None], dtype=dtype))
