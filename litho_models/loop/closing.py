@@ -76,22 +76,13 @@ class Closed:
         """All findings that are reported."""
         return [*self.traced, *self.described.causes]
 
-    def survives_on(self, cause: Cause) -> list[str]:
-        """The other bases beside which the search found the same cause, or an effect that looks the same."""
-        alike = {cause.name, *cause.alike}
-        return [
-            name
-            for name, rival in self.rivals.items()
-            if any(alike & {one.name, *one.alike} for one in rival.causes)
-        ]
-
     def needed_by_all(self, cause: Cause) -> bool:
         """Whether every other base lacks the cause too, except bases with more parameters, which may have
         absorbed it.
         """
-        base, survives_on = self.plain.twin.own, self.survives_on(cause)
-        others = {name for name, rival in self.rivals.items() if rival.state.twin.own <= base}
-        return others <= {*survives_on}
+        base = self.plain.twin.own
+        small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
+        return len(survives_on(cause, small)) == len(small)
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
@@ -147,13 +138,24 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     )
 
 
+def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
+    """The bases beside which a search found the cause, or one of its set."""
+    alike = {cause.name, *cause.alike}
+    return [
+        name
+        for name, found in searches.items()
+        if any(alike & {one.name, *one.alike} for one in found.causes)
+    ]
+
+
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """Choose the base with the fewest parameters, causes included, among those with nearly the smallest
-    error.
-    """
+    """Of the bases that do as well as the best the one whose causes the others share, with fewest numbers."""
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
-        name: len(found.state.twin.vector)
+        name: (
+            sum(len(survives_on(cause, searches)) < len(searches) for cause in found.causes),
+            len(found.state.twin.vector),
+        )
         for name, found in searches.items()
         if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
     }

@@ -11,7 +11,7 @@ from scipy.stats import t
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.effect import Knowledge
 from litho_models.fitting.least_squares import Linearised, eliminated, eliminated_sum
-from litho_models.loop.closing import Closed
+from litho_models.loop.closing import Closed, survives_on
 from litho_models.loop.fits import RULES, State
 from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.loop.model import Twin
@@ -139,7 +139,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         group_p=cause.group_p,
         reshaped_share=cause.reshaped_share,
         left_out_nm=left_out_nm,
-        survives_on=closed.survives_on(cause),
+        survives_on=survives_on(cause, closed.rivals),
     )
 
 

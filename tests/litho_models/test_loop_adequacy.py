@@ -169,15 +169,23 @@ def test_a_cause_that_a_base_as_small_does_not_need_is_described(
     assert (found.knowledge, found.survives_on) == (knowledge, found_on)
 
 
-@pytest.mark.parametrize(("better_nm2", "chosen"), [(98.1, "physics"), (97.9, "blur-table")])
-def test_the_base_with_the_fewest_numbers_is_taken_if_none_is_better_by_two_percent(
-    better_nm2: float, chosen: str
+@pytest.mark.parametrize(
+    ("better_nm2", "own", "chosen"),
+    [
+        (98.1, "hatch-ripple", "physics"),  # less than 2 % better
+        (97.9, "hatch-ripple", "blur-table"),
+        (100.0, "slope-thinning", "affine-mtf"),  # all causes shared: fewer numbers
+    ],
+)
+def test_of_bases_that_do_as_well_the_one_is_taken_whose_causes_the_others_share(
+    better_nm2: float, own: str, chosen: str
 ) -> None:
-    """Causes count: one that another base does not need is the price of this one."""
+    """A cause that only one base needs is the price of that base."""
+    shared = gaining("slope-thinning", 10)
     found = {
-        "affine-mtf": Found(with_base(7, 9)),
-        "blur-table": Found(with_base(14, 1, better_nm2)),
-        "physics": Found(with_base(7, 5)),
+        "affine-mtf": Found(with_base(7, 1), [replace(shared, name=own), shared]),
+        "blur-table": Found(with_base(14, 1, better_nm2), [shared]),
+        "physics": Found(with_base(7, 5), [shared]),
     }
     assert closing._simplest(found) == chosen
 
