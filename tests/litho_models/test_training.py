@@ -397,7 +397,7 @@ def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
     def of_process(rank, count):
         """What one process adds to the sum over processes."""
         added = []
-        monkeypatch.setattr(network, "rank_and_count", lambda: (rank, count))
+        monkeypatch.setattr(network, "joined", lambda: (rank, count))
         monkeypatch.setattr(
             network, "add_over_processes", lambda own: added.extend(one.clone() for one in own)
         )
