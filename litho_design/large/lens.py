@@ -109,7 +109,4 @@ class RingLens(DirectLensTask):
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
         """Figures along the radius."""
-        return Findings(
-            reference_efficiency=self.reference_efficiency(height_um),
-            predicted=self.score(height_um).model_dump(),
-        )
+        return Findings(predicted=self.score(height_um).model_dump(), baselines=self.baselines())

@@ -135,10 +135,6 @@ class LensTask(Task):
         """Figures of the PSF of a print."""
         return lens_score(self.bench, height_um)
 
-    def reference_efficiency(self, height_um: Tensor) -> float:
-        """Focusing efficiency of a perfect lens of this aperture, whatever the print."""
-        return lens_score(self.bench, self.bench.ideal_height_um()).focusing_efficiency
-
     def baselines(self) -> dict[str, dict[str, float]]:
         """Scores of a perfect lens and of a flat plate on the same grid."""
         ideal = self.bench.ideal_height_um()
