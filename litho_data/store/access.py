@@ -53,7 +53,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
     return _of_kind(parent, name, zarr.Group, "group")
 
 
-def array_of(parent: zarr.Group, name: str) -> zarr.Array:
+def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
     """The child array of that name.
 
     Raises:
@@ -82,7 +82,7 @@ def values_of(parent: zarr.Group, name: str) -> Array:
     return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
 
 
-def decoded(array: zarr.Array, selection: Any, what: str) -> Array:
+def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
     """A selection of an array.
 
     Raises:

@@ -1,9 +1,8 @@
-"""Laws without a name: short formulas of the height, its slopes and surroundings, the place and the order.
+"""Laws: short formulas of height, slopes, surroundings, position and order.
 
-Each is an effect like any other, with one strength (and the position of a jump), so that it is screened,
-fitted, judged and applied by the same code. It says by which formula the height departs from the model, not
-why. Tables are the same with many strengths: they follow whatever their covariate carries, and explain
-nothing.
+A law is an effect with one strength (and the position of a jump), so the same code screens, fits, judges and
+applies it. It states how the height departs from the model, not why. Tables have many strengths; they follow
+any dependence on their covariate and explain nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j
 _TURN = "print and scan the same layouts turned by 90 degrees"
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
-# (y, x) of the directions along which a slope is taken.
+# Directions of slopes, as (y, x).
 _DIRECTIONS = {
     "x": (0.0, 1.0),
     "y": (1.0, 0.0),
@@ -45,25 +44,25 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Surface:
-    """What formulas speak of: a height h (b, 1, y, x), µm, in its field, and the numbers of the law."""
+    """Quantities for formulas, from a height h (b, 1, y, x), µm, its field, and the law's parameters."""
 
     h: Tensor
     context: FieldContext
     values: Values
 
     def slope(self, direction: str, of: Tensor | None = None) -> Tensor:
-        """Slope of a map, of the height unless given, along a direction by central differences."""
+        """Slope of a map (by default the height) along a direction, by central differences."""
         along_y, along_x = _DIRECTIONS[direction]
         y, x = gradient(self.h if of is None else of, self.context.pitch_um)
         return along_y * y + along_x * x
 
     def size(self, power: float, *directions: str) -> Tensor:
-        """A power of the size of a slope, or of the steepness, rounded off near zero so that it is smooth."""
+        """A power of the absolute slope along a direction, or of the steepness, smoothed near zero."""
         squared = torch.stack([self.slope(one) for one in directions]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """x, y, r², or the nearness of the scan's edge, e^(-distance / 2 µm), of the pixel in its scan."""
+        """x, y, r² or the closeness to the scan's edge, e^(-distance / 2 µm), of each pixel."""
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
@@ -72,18 +71,20 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """1 beyond the law's position along an axis of the scan, 0 before it, and between within a pixel."""
+        """A step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
+        pixel.
+        """
         y, x = self.context.scan_position()
         at, size = (y, self.context.whole_shape()[0]) if axis == "y" else (x, self.context.whole_shape()[1])
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h) + 0 * self.h
 
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
-        """Mean nearby of a map, of the height unless given, weighted by a Gaussian."""
+        """Gaussian-weighted local mean of a map, by default the height."""
         field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
         return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
 
     def beside(self, side: str, length_um: float) -> Tensor:
-        """Mean height on one side, weighted by an exponential of that length."""
+        """Exponentially weighted mean height on one side, with the given decay length."""
         axis, sign = _SIDES[side]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
@@ -93,18 +94,18 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
     def along(self, direction: str, length_um: float) -> Tensor:
-        """Mean height along a direction, to both sides, weighted by an exponential of that length."""
+        """Exponentially weighted mean height along a direction, to both sides."""
         along_y, along_x = _DIRECTIONS[direction]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            # Both sides together: their phases cancel.
+            # The phases of both sides cancel.
             return trailing_response(along_y * fy + along_x * fx, length, pitch).real - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
 
-# The map that a strength multiplies, (b, 1, y, x).
+# Computes the map (b, 1, y, x) that a strength multiplies.
 Column = Callable[[Surface], Tensor]
 
 
@@ -202,7 +203,7 @@ def _law(name: str, formula: str, unit: str, column: Column, **shapes: Parameter
         return height + values["strength"] * column(Surface(height, context, values))
 
     return Effect(
-        # It may be a part of the name of a parameter.
+        # The name may become part of a parameter's name.
         name=name.replace(".", "-"),
         title=f"height changed by {formula}",
         stage="development",
@@ -228,7 +229,7 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
     )
 
 
-@_table("a height of its own for each level", _KNOTS, "µm")
+@_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """One correction for each of seventeen heights of the layout, linear between them."""
     knots = torch.stack([values[name] for name in _KNOTS])
@@ -241,7 +242,9 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
+    """A weight for the height difference to each displaced position; the field is continued beyond its
+    edge.
+    """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
@@ -252,9 +255,9 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
     return total
 
 
-@_table("a gain that follows the place in the scan", _POWERS, "1")
+@_table("a gain that depends on the position in the scan", _POWERS, "1")
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The height times a polynomial of the place in the scan."""
+    """The height times a polynomial of the position in the scan."""
     y, x = context.scan_position()
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 

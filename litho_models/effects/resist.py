@@ -1,4 +1,4 @@
-"""Resist: how dose becomes height, and what shrinks, stays or is lost when it is developed."""
+"""Resist: conversion of dose to height, shrinkage, and gains and losses in development."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Normalised tanh projection about η, identity for α² -> 0 and a step for α² -> inf.
+    """Normalised tanh projection about η: the identity for α² -> 0, a step for α² -> inf.
 
-    With x = H / full height: sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)), which is the
-    quotient of sums of tanh usually printed, and is even and analytic in α.
+    With x = H / full height it is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This equals the usual
+    quotient of sums of tanh and is even and analytic in α.
     """
     full, centre = context.full_height_um, values["centre"]
     relative = height / full
@@ -63,7 +63,7 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H / (1 + q |H|): tall structures grow less than the dose says."""
+    """H / (1 + q |H|): tall structures grow less than in proportion to the dose."""
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
@@ -99,10 +99,10 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(r + s H(r) / full r), r from the centre of the field: tops pull in, more than bases.
+    """H(r + s H(r) / full r), r from the centre of the field: tops shrink inwards more than bases.
 
-    What the mean height pulls is a magnification, which registration has taken out of a scan: what it shows
-    at x is what lies at r = x / (1 + s mean / full).
+    The mean height causes a magnification, which registration removes: a scan shows at x what lies at r = x /
+    (1 + s mean / full).
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -122,7 +122,7 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - φ (H - open_w(H)): what is narrower than w loses a share of its height above its surroundings."""
+    """H - φ (H - open_w(H)): features narrower than w lose a share of their height above the surroundings."""
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
 
@@ -138,9 +138,9 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Closing by a square: whatever is narrower and lower than its surroundings is filled.
+    """Closing by a square: pits narrower than the square are filled.
 
-    A square is an odd number of pixels wide; between two of them the closing is interpolated.
+    Squares are an odd number of pixels wide; other widths are interpolated.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -149,13 +149,13 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:
-    """Closing by a square of 2 half_px + 1 pixels; the field goes on beyond its edge."""
+    """Closing by a square of 2 half_px + 1 pixels; the field is continued beyond its edge."""
     padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
     return -_largest(-_largest(padded, half_px), half_px)
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """The largest value in a square around each pixel that has all of it, one axis after the other."""
+    """The largest value in the square around each pixel whose square lies inside, axis by axis."""
     size = 2 * half_px + 1
     return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
 
@@ -181,7 +181,7 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2): height missing on slopes, by turned axes x', y'.
 
-    With cx = cy = c it is c |grad H|^p, whichever way the slope faces; p = 1 sets each edge back by about c.
+    With cx = cy = c this is c |grad H|^p in any direction. With p = 1 each edge is set back by about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)

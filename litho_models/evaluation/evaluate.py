@@ -38,7 +38,6 @@ def evaluate(
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
     open_lock_box: bool = False,
-    device: str = "cpu",
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
@@ -68,7 +67,7 @@ def evaluate(
     film = dataset.instrument == "sem"
     policy, background = policy or usual_policy(film), background or usual_background(film)
     floor = stated_floor(dataset.name, noise)
-    frozen = load_frozen(model, device=device, extrapolate=extrapolate)
+    frozen = load_frozen(model, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Evaluation.FILE_NAME, subject):

@@ -47,36 +47,6 @@ class FitDiagnostics(Record):
     held_out_nm: float
 
 
-def diagnose(
-    model: Simulator,
-    scans: Sequence[PrintedScan],
-    validation_ids: Sequence[str],
-    held_out: Sequence[PrintedScan],
-    held_out_um: Sequence[np.ndarray],
-    measured: bool = False,
-) -> FitDiagnostics:
-    """Examine a fitted model.
-
-    Args:
-        model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
-        held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
-        measured: also learn the measurement model from the model's residuals.
-    """
-    heights = [predict_scan(model, scan) for scan in progress(scans, "predicting")]
-
-    def error_nm(chose: bool) -> float:
-        own = [one for one in zip(scans, heights, strict=True) if (one[0].id in validation_ids) == chose]
-        return mean_error_nm([scan for scan, _ in own], [height for _, height in own])
-
-    return FitDiagnostics(
-        background=learn_background(scans, heights),
-        measurement=learn_measurement(scans, heights) if measured else None,
-        training_nm=error_nm(False),
-        inner_validation_nm=error_nm(True) if validation_ids else None,
-        held_out_nm=mean_error_nm(held_out, held_out_um),
-    )
-
-
 _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
@@ -163,25 +133,36 @@ def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
 
 
 def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool) -> None:
-    heights = [predict_scan(fitted.model, scan) for scan in fold.held_out]
+    model, chose = fitted.model, fitted.validation_ids
+    held_out = [predict_scan(model, scan) for scan in fold.held_out]
+    own = [predict_scan(model, scan) for scan in progress(fold.training, "predicting")]
+
+    def error_nm(chosen_on: bool) -> float:
+        pairs = [pair for pair in zip(fold.training, own, strict=True) if (pair[0].id in chose) == chosen_on]
+        return mean_error_nm([scan for scan, _ in pairs], [height for _, height in pairs])
+
     record = FitRecord(
-        model=fitted.model.name,
+        model=model.name,
         fold=fold.number,
         key=key,
         training_ids=fitted.training_ids,
-        validation_ids=fitted.validation_ids,
+        validation_ids=chose,
         held_out_ids=[scan.id for scan in fold.held_out],
-        parameters=fitted.model.parameter_count,
+        parameters=model.parameter_count,
         seconds=fitted.seconds,
         steps=[entry.step for entry in fitted.history],
-        at_bounds=fitted.model.at_bounds,
+        at_bounds=model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
-        diagnostics=diagnose(
-            fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured
+        diagnostics=FitDiagnostics(
+            background=learn_background(fold.training, own),
+            measurement=learn_measurement(fold.training, own) if measured else None,
+            training_nm=error_nm(False),
+            inner_validation_nm=error_nm(True) if chose else None,
+            held_out_nm=mean_error_nm(fold.held_out, held_out),
         ),
     )
     with atomic_folder(folder) as temporary:
-        for number, height in enumerate(heights):
+        for number, height in enumerate(held_out):
             np.save(temporary / _PREDICTION.format(number), height)
         (temporary / _FIT).write_text(record.model_dump_json(indent=1), encoding="utf-8")

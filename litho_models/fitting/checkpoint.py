@@ -3,23 +3,22 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.results import Record
 from litho_models.simulator import Simulator
 
 
-class RoundRecord(BaseModel):
+class RoundRecord(Record):
     """One round of training; the validation error is None where no scans were set aside."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     step: int
     training_mae_nm: float
@@ -27,14 +26,14 @@ class RoundRecord(BaseModel):
     seconds: float
 
 
+@dataclass
 class TrainingState:
-    """The model, its optimiser, and the best weights so far."""
+    """The model, its optimiser, the rounds so far, and the best weights."""
 
-    def __init__(self, model: Simulator, optimiser: torch.optim.Optimizer):
-        self.model = model
-        self.optimiser = optimiser
-        self.history: list[RoundRecord] = []
-        self.best: dict[str, Tensor] = {}
+    model: Simulator
+    optimiser: torch.optim.Optimizer
+    history: list[RoundRecord] = field(default_factory=list)
+    best: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def step(self) -> int:

@@ -11,7 +11,6 @@ from litho_data.commands.progress import say
 from litho_data.commands.settings import refused
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import require_known
-from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
@@ -122,7 +121,6 @@ def train(
             },
             limitations=["Not evaluated yet: see the evaluation of this model for its error."],
         )
-        _write_history(record, folder)
         record.write(folder)
     return record
 
@@ -159,10 +157,3 @@ def step_share(scans: Sequence[PrintedScan]) -> list[float]:
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )
     return (np.bincount(steps, minlength=scans[0].levels) / steps.size).tolist()
-
-
-def _write_history(record: TrainingRun, folder: Path) -> None:
-    import pandas as pd
-
-    with atomic_file(folder / "history.csv") as temporary:
-        pd.DataFrame([entry.model_dump() for entry in record.history]).to_csv(temporary, index=False)

@@ -1,9 +1,9 @@
-"""Close the loop on a set of scans: from the residual of a base to causes, laws and what is left.
+"""Close the loop on a set of scans: find causes and laws in the residual of a base.
 
-Bases compete by what they explain together with causes: causes are sought beside each of them.
+The search for causes is run beside each base, and bases are compared with their causes.
 
-``close`` is an estimator: it chooses and fits on the scans that it is given, and what it returns predicts any
-other scan. Whatever is judged on scans is chosen without them by calling it on the rest.
+``close`` is an estimator. It chooses and fits on the given scans, and its result predicts any other scan. To
+judge the choices on some scans, call it on the others.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from litho_models.scan_terms.grouped import ALL
 
 @dataclass(frozen=True)
 class Closed:
-    """What was chosen and fitted on some scans.
+    """The choices and fits made on some scans.
 
     Attributes:
-        base_name: of the base that was taken; ``rivals``: what the same search found beside the others.
-        plain: the base fitted to the scans as they are; ``base``: to scans freed of what a group shares.
-        named: among causes; ``lawful``: among short laws beside them.
-        described: tables over a covariate, which say where the rest lies; the model has them last.
-        rests: what features of layout and place still explain, by stage.
-        untestable: effects that could not be tested, with the reason.
+        base_name: name of the chosen base; ``rivals``: results of the same search beside the other bases.
+        plain: the base fitted to the original scans; ``base``: the base fitted to the freed scans.
+        named: result of the search among causes; ``lawful``: of the search for short laws beside them.
+        described: tables over a covariate, which describe the remaining error; they act last in the model.
+        rests: what features of layout and position still explain after each stage.
+        untestable: effects that could not be tested, with reasons.
     """
 
     base_name: str
@@ -53,17 +53,17 @@ class Closed:
 
     @property
     def given(self) -> Study:
-        """The scans as they are."""
+        """The original scans."""
         return self.plain.study
 
     @property
     def study(self) -> Study:
-        """The freed scans."""
+        """The scans without what groups of them share."""
         return self.base.study
 
     @property
     def final(self) -> State:
-        """The corrected model: causes, laws, and tables where neither holds."""
+        """The corrected model, with causes, laws and tables."""
         return self.described.state
 
     @property
@@ -73,11 +73,11 @@ class Closed:
 
     @property
     def found(self) -> list[Cause]:
-        """All that is reported."""
+        """All findings that are reported."""
         return [*self.traced, *self.described.causes]
 
     def survives_on(self, cause: Cause) -> list[str]:
-        """The other bases beside which the search found the same cause, or one of its set."""
+        """The other bases beside which the search found the same cause, or an effect that looks the same."""
         alike = {cause.name, *cause.alike}
         return [
             name
@@ -86,24 +86,26 @@ class Closed:
         ]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Whether every other base lacks the cause too; one with more numbers may have taken it up."""
+        """Whether every other base lacks the cause too, except bases with more parameters, which may have
+        absorbed it.
+        """
         base, survives_on = self.plain.twin.own, self.survives_on(cause)
         others = {name for name, rival in self.rivals.items() if rival.state.twin.own <= base}
         return others <= {*survives_on}
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find what a base lacks on these scans.
+    """Find what a base model lacks on these scans.
 
     Args:
         study: development scans.
-        bases: simulators by name, those with few parameters refitted, others taken as they are.
+        bases: simulators by name. Those with few parameters are refitted.
     """
     plain = {}
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
         plain[name] = fit_state(Twin.bare(base), study)
-    study.report("learning what scans of a group share")
+    study.report("learning what groups of scans share")
     nearest = min(plain.values(), key=lambda state: state.mse_nm2)
     freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
     excluded = untestable(freed)
@@ -130,7 +132,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
     ):  # fmt: skip
-        # By the model, so that a stage that changes nothing counts with the one before it.
+        # Stages are told apart by their model: one that changes nothing equals the stage before it.
         stages.setdefault(state, name)
     return Closed(
         base_name=chosen,
@@ -146,7 +148,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
 
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """The base that needs the fewest numbers, causes included, of those that do as well as the best."""
+    """Choose the base with the fewest parameters, causes included, among those with nearly the smallest
+    error.
+    """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
         name: len(found.state.twin.vector)
@@ -157,21 +161,21 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Laws beside the causes, and tables beside both; each cause is checked with everything else in place.
+    """Search for laws, then tables, beside the causes, and check each cause beside everything else.
 
-    One that fails is taken out, and laws are sought anew without it.
+    A cause that fails is removed, and the search for laws is repeated without it.
 
     Args:
-        start: the base; ``named``: its causes, of which those remain whose names stand.
+        start: the base; ``named``: its causes, from which refused ones are removed.
     """
     study = start.study
-    # Laws and tables are of heights.
+    # Laws and tables describe heights, not films.
     laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
-        study.report("looking for a law in what is left")
+        study.report("searching the residual for laws")
         lawful = search(named.state, laws, 4, secants)
-        study.report("describing what is left")
+        study.report("describing the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
             in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
@@ -183,7 +187,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # What may only correct another formula goes first: that formula is then judged without it.
+        # Causes that may only correct another formula are removed first, so that formula is judged without
+        # them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -193,7 +198,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """The model with every table that is confirmed there too, fitted beside all the rest."""
+    """Add to the model every table that is still confirmed when fitted with all other parts."""
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
@@ -205,9 +210,9 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """The model, with the largest table beside it if that takes more than all causes together.
+    """Add the largest table to the model if it gains more than all causes together.
 
-    A table follows whatever it can. It is held against all causes, not against single ones.
+    A table fits almost anything, so it is compared with all causes together, not with single ones.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

@@ -1,4 +1,4 @@
-"""Errors of the models of a loop on scans held out from them, the measurement learned with each."""
+"""Errors of a loop's models on held-out scans, each with its own measurement model."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy; films have no zero of their own to be freed of.
+    """Errors of maps (y, x), µm, under each reported policy. Scans of films have no free zero.
 
     Args:
-        numbers: fitted numbers of printer and measurement; ``terms``: model, measurement and held_out of
-            ``ErrorRow``.
+        numbers: number of fitted parameters of printer and measurement;
+            ``terms``: ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``.
     """
     rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
@@ -70,10 +70,10 @@ def error_rows(
 
 
 class HeldOut:
-    """The models that a loop has found, each fitted with its measurement to other scans than are scored.
+    """Models of a loop, fitted with their measurement models to scans that are not scored.
 
     Args:
-        closed: what was found.
+        closed: result of ``close``.
     """
 
     def __init__(self, closed: Closed):
@@ -84,20 +84,21 @@ class HeldOut:
 
     @property
     def ends(self) -> dict[Stage, State]:
-        """Base and corrected model."""
+        """The base and the corrected model."""
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Of all models, scans predicted without their fold; of first and last also without their print.
+        """Errors of all models, each scan predicted without its fold; of base and final model also without
+        its print.
 
-        Between them stands the model with the causes alone, if it is neither.
+        If it differs from both, the model with only the causes is listed between them.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
         maps = plain.maps_um(self.study.scans)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
         if not self.study.of_films:
-            # A smooth background has five numbers.
+            # A smooth background has five coefficients.
             rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
         between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
         for name, state in {"base": self.closed.base, **between, **self.ends}.items():
@@ -112,13 +113,13 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """The maps (y, x) that the scans should show, print and measurement learned without their fold."""
+        """Predicted scans (y, x), with print and measurement learned without the scan's fold."""
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) without each cause or law, the rest fitted again.
+        """Increase of the error (k = 1) without each cause or law, after the others are refitted.
 
-        The printer is left as it stands, the measurement learned again beside it.
+        The printer's own values stay fixed, and the measurement is learned again.
         """
 
         def error_nm(state: State) -> float:
@@ -133,7 +134,7 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Residual maps (y, x), nm, of all scans before and after, each with its own zero taken out."""
+        """Residual maps (y, x), nm, of all scans before and after, without the offset of each scan."""
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
             left = np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan)
@@ -155,10 +156,10 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Maps of all scans by fits without their part, and the most numbers that any of them took.
+        """Maps of all scans by fits without their part, and the largest number of parameters of these fits.
 
         Args:
-            starts: part to where its fit begins.
+            starts: part to the start of its fit.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -190,7 +191,7 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
+    """Errors of all scans by models chosen without them; ``found``: these models, and the scans of each."""
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))
     for models, out in found:

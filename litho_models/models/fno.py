@@ -156,7 +156,8 @@ class SpectralConvolution(nn.Module):
         modes_y, modes_x = self.weight.shape[3:5]
         kept_y, kept_x = min(modes_y, ny // 2), min(modes_x, nx // 2 + 1)
         with torch.autocast(device_type=field.device.type, enabled=False):
-            spectra = torch.fft.rfft2(field.to(self.weight.dtype), dim=(1, 2))
+            along_x = torch.fft.rfft(field.to(self.weight.dtype), dim=2)[:, :, :kept_x]
+            spectra = torch.fft.fft(along_x, dim=1)
             positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
             mixed = torch.zeros_like(spectra)
             # Rows of a spectrum begin with frequency 0 and end with -1.
@@ -164,8 +165,8 @@ class SpectralConvolution(nn.Module):
                 (slice(kept_y), positive[:, :, :kept_y]),
                 (slice(ny - kept_y, ny), negative[:, :, modes_y - kept_y :]),
             ):
-                mixed[:, rows, :kept_x] = torch.einsum("byxi,ioyx->byxo", spectra[:, rows, :kept_x], matrices)
-            return torch.fft.irfft2(mixed, s=(ny, nx), dim=(1, 2))
+                mixed[:, rows] = torch.einsum("byxi,ioyx->byxo", spectra[:, rows], matrices)
+            return torch.fft.irfft(torch.fft.ifft(mixed, dim=1), n=nx, dim=2)
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:

@@ -25,7 +25,6 @@ def check(
     new: Sequence[str] = (),
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
-    device: str = "cpu",
 ) -> Check:
     """Compare new prints with those that a model was made of; write ``check.json``, a report and tables.
 
@@ -37,7 +36,6 @@ def check(
         new: names of prints of ``store`` that are new; its others are then the reference.
         false_alarms: chance that an unchanged data set raises an alarm, over all figures.
         tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
-        device: where the model runs.
 
     Raises:
         InputError: a model or store that cannot be read or does not fit, or too few prints.
@@ -47,7 +45,7 @@ def check(
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
     dataset = open_store(store)
-    frozen = load_frozen(model, device=device)
+    frozen = load_frozen(model)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Check.FILE_NAME, subject) as begun:
         say(f"checking {len(dataset)} scans of {dataset.name}")

@@ -7,6 +7,7 @@ that carry a dose: step ladders, or any layout with areas of one level wider tha
 from collections.abc import Sequence
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
@@ -46,6 +47,8 @@ class DoseRow(Record):
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
 
+    model_config = ConfigDict(extra="ignore")
+
     dose: float
     scans: list[str]
     levels: list[LevelHeight]
@@ -55,8 +58,6 @@ class DoseRow(Record):
     lost_low: int
     lost_high: int
     worst_readability: float
-    under_exposed: bool
-    over_exposed: bool
 
 
 class DoseMatrix(Record):
@@ -127,8 +128,6 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
         lost_low=lost_low,
         lost_high=lost_high,
         worst_readability=float((step / spread).min()),
-        under_exposed=lost_low > 0,
-        over_exposed=lost_high > 0 and lost_low < len(lost),
     )
 
 

@@ -65,7 +65,7 @@ def dose(found: DoseMatrix) -> Figure:
         axes.set_xlabel("relative dose")
         axes.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
         for row in found.rows:
-            if row.under_exposed or row.over_exposed:
+            if row.lost_low or row.lost_high:
                 width = np.ptp(doses) / max(1, len(doses) - 1) / 2
                 axes.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
     return figure

@@ -57,9 +57,9 @@ def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> t
     Args:
         values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
     """
-    names = list(dict.fromkeys(groups))
-    member = np.array([names.index(group) for group in groups], np.intp)[owner]
-    sums, counts = np.bincount(member, values), np.bincount(member)
+    sums, counts = (
+        _by_group(np.bincount(owner, own, minlength=len(groups)), groups)[0] for own in (values, None)
+    )
     seen = counts > 0
     if seen.sum() < FEWEST_FOR_INTERVAL:
         return None
@@ -73,7 +73,7 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
     return float(low), float(high)
 
 
-def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
+def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
     """Sum and count of the values of each group; each value by itself without groups."""
     sample = np.asarray(values, np.float64)
     if groups is None:

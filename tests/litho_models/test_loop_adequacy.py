@@ -67,9 +67,9 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
     ("reshaped_nm2", "left_nm2", "exhausted", "said"),
     [
         (1.4, 0.0, [], ""),  # 14 % of its gain in other shapes
-        (1.6, 5.0, [], "takes 16 % of its gain"),
+        (1.6, 5.0, [], "gain another 16 %"),
         (1.6, 5.4, [], ""),  # more than twice as much again is left for causes that are missing
-        (1.6, 5.4, ["fraction"], "more of it than there can be: fraction"),
+        (1.6, 5.4, ["fraction"], "beyond the largest possible one: fraction"),
         (1.4, 0.0, ["fraction"], ""),
     ],
 )

@@ -200,10 +200,10 @@ def test_the_dose_matrix_sees_height_roughness_and_lost_steps():
     assert [row.dose for row in found.rows] == doses
     under, low, nominal, high, over = found.rows
     # Levels 0, 1 and 2 are one height: two steps lost. 0.75 µm is reached below level 6 (0.78 µm).
-    assert (under.lost_low, under.under_exposed, under.over_exposed) == (2, True, False)
-    assert (over.lost_high, over.over_exposed, over.under_exposed) == (2, True, False)
+    assert (under.lost_low, under.lost_high) == (2, 0)
+    assert (over.lost_low, over.lost_high) == (0, 2)
     for row in (low, nominal, high):
-        assert (row.under_exposed, row.over_exposed) == (False, False)
+        assert (row.lost_low, row.lost_high) == (0, 0)
         # The tilt along the ladder is known from the slopes within 9 treads of 20 x 40 px only: the x of a
         # tread spreads by 20/√12 of 360 px, so 6 nm leave 4.4 nm over the field, 0.6 % of 800 nm.
         assert row.height_gain == pytest.approx(row.dose, abs=0.02)
@@ -218,7 +218,7 @@ def test_shrinkage_alone_is_no_wrong_exposure_and_the_nearest_height_wins():
         for dose in (0.9, 1.0, 1.15)
     ]
     found, _ = dose_matrix(shrunk)
-    assert not any(row.under_exposed or row.over_exposed for row in found.rows)
+    assert not any(row.lost_low or row.lost_high for row in found.rows)
     # 0.6 · 1.15 = 0.69 is the nearest to 1.
     assert found.recommended_dose == 1.15
 
