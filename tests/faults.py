@@ -219,6 +219,18 @@ FAULTS = [
     Fault("a tip of another height", "litho_design/judging/measured.py",
           "replace(scan, height_um=surface), radius_um", "scan, radius_um",
           "tests/litho_design/test_measured_judges.py -k pillar"),
+    Fault("lines that vary together up to the second place", "litho_data/roughness/step_height.py",
+          "int(negative[0])", "int(negative[1])", "tests/litho_data/test_calibration.py -k vary_together"),
+    Fault("a layout that is drawn with no line", "litho_models/evaluation/plots.py",
+          'color="#c9d1da", lw=1,', 'color="#c9d1da", lw=0,', "tests/test_tables.py -k profiles"),
+    Fault("a plane that ends before what is measured", "litho_data/register/topography.py",
+          "height.shape[0] - 1)", "height.shape[0] - 2)",
+          "tests/litho_data/test_register_resample.py -k gap_continues"),
+    Fault("an estimate of all fits where each has its own", "litho_models/evaluation/benchmark.py",
+          "len(jobs) if places.elsewhere else 0", "0 if places.elsewhere else len(jobs)",
+          "tests/litho_models/test_benchmark_messages.py -k one_estimate"),
+    Fault("a long table that is not folded", "litho_models/planning/report.py",
+          'page.heading("Scans", folded=True)', 'page.heading("Scans", folded=False)', f"{NEXT} -k waiting"),
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What a hologram is optimised for.
+"""The loss of a hologram.
 
 To add a term, give it a weight in ``HologramLoss`` and a line in ``hologram_loss``.
 """

@@ -1,4 +1,4 @@
-"""How a layout compares with a model's training layouts: its distance, a penalty on it, the model's error."""
+"""Compare a layout with a model's training layouts: distance, penalty, and the model's own error."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """By how much a layout exceeds twice the tails of a model's training layouts, in levels.
+    """The excess of a layout over twice the tails of a model's training layouts, in levels.
 
     For every k, three shares are compared: of pixels at level k or lower, of pixels at k or higher, and of
     neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
@@ -135,7 +135,7 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """In words, what ``share`` has much more of than ``trained``; empty if nothing."""
+    """Describe what ``share`` has much more of than ``trained``; empty if nothing."""
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:
         return []

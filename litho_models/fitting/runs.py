@@ -31,7 +31,7 @@ CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(Result):
-    """``run.json``: what was trained, on what, and how it went."""
+    """``run.json``: the record of a training."""
 
     SCHEMA: ClassVar[str] = "litho-models/run/1"
     FILE_NAME: ClassVar[str] = "run.json"
@@ -126,7 +126,7 @@ def train(
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """The checked settings of a recipe; those that training does not know go to the model.
+    """The checked settings of a recipe; settings unknown to training go to the model.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.

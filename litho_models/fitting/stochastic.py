@@ -1,8 +1,8 @@
-"""Models with many parameters: stochastic gradient on random crops, in rounds.
+"""Train models with many parameters by stochastic gradient on random crops, in rounds.
 
-Between rounds the scan terms are estimated anew from whole-scan predictions, the inner
-validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
-that is random is a function of seed and step, so a killed run continues to the same result.
+Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
+scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
+and step, so an interrupted run continues to the same result.
 """
 
 import math
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
@@ -78,7 +79,8 @@ def train_network(
             validation_mae_datum_free_nm=validation_error(model, validation),
             seconds=time.monotonic() - started,
         )
-        if not np.isfinite([record.training_mae_nm, record.validation_mae_datum_free_nm or 0]).all():
+        errors_nm = record.training_mae_nm, record.validation_mae_datum_free_nm or 0.0
+        if not HEIGHT_UM.holds([one / NM_PER_UM for one in errors_nm]):
             raise _diverged(model, last)
         state.record(record)
         if checkpoints is not None:
@@ -89,7 +91,7 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Run steps up to ``last``; InputError if numbers become infinite or NaN, whatever fails then."""
+    """Run steps up to ``last``; raise InputError if numbers become infinite or NaN."""
     try:
         yield
         error = None
@@ -104,7 +106,7 @@ def _diverging(model: Simulator, last: int) -> Iterator[None]:
 def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
-        got=f"weights or errors that are not finite at step {step}",
+        got=f"weights or errors beyond all heights at step {step}",
         wanted="steps that converge",
         hint="try a smaller learning_rate",
     )
@@ -168,10 +170,10 @@ def _losses(
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # A pixel counts as much as it will in the blended field.
+        # Each pixel has its weight in the blended field.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
+    # A mean over all pixels, valid or not, so crops count equally in groups of any size.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 

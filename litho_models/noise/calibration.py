@@ -1,4 +1,4 @@
-"""Is a stated spread right? Judged on prints that it was not fitted on."""
+"""Test the calibration of a stated spread on prints outside its fit."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -26,7 +26,7 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
-# Roughness is correlated over ten pixels and more, so that more pixels tell nothing new.
+# Roughness is correlated over ten pixels and more, so more pixels add no information.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
@@ -46,7 +46,7 @@ class ScanCalibration(Record):
 
 
 class Calibration(Record):
-    """A description of the spread and how well it holds on prints that it was not fitted on.
+    """A description of the spread, and its calibration on prints outside its fit.
 
     Args:
         name: constant, or by covariates.
@@ -66,7 +66,7 @@ class Calibration(Record):
 
 
 class SigmaBin(Record):
-    """Pixels within one range of one covariate: measured and predicted spread, and how far the latter holds.
+    """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
 
     Coverage at 68 and 95 % with 95 % intervals over prints.
     """
@@ -113,10 +113,9 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit a constant and a covariate spread without each print, and judge both on the prints left out.
+    """Fit a constant and a covariate spread without each print, and judge both on that print.
 
-    With fewer than three prints scans are left out instead. The tails are chosen with the scale, on the
-    prints that both are fitted to.
+    With fewer than three prints, scans are left out instead. Tails and scale are fitted together.
 
     Raises:
         InputError: fewer than three scans.
@@ -165,7 +164,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 def calibrate(
     name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
-    """Judge a stated spread on every scan; pixels first, then scans."""
+    """Judge a stated spread on every scan, and average over scans."""
     rows, histograms = [], []
     for scan, residual, (scale, tails) in zip(scans, residuals_nm, stated, strict=True):
         scored = np.isfinite(residual)
@@ -198,7 +197,7 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """All pixels, each level, and ranges of equal count of what else the spread depends on."""
+    """Bins of all pixels, of each level, and of equal counts of every other covariate."""
     used = [np.isfinite(residual) for residual in residuals_nm]
 
     def pooled(maps: Sequence[Array]) -> Array:
