@@ -202,7 +202,7 @@ def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
                 wanted="the path of its picture, with a folder in front",
             )
         place = names.index(imaged)
-        return task.objects[place], items[place]
+        return (*task.objects, *task.tested)[place], items[place]
     if imaged is None or not Path(imaged).is_file():
         given = imaged or "no --camera-object"
         raise unknown_name("photographed object", given, names, also="a picture's path")

@@ -91,9 +91,9 @@ class LensTask(Task):
         _check(settings)
         imaging = settings.imaging
         objects = (*imaging.objects, *imaging.test_objects)
-        stack = object_stack(objects, imaging.object_px, (inputs or {}).get(PICTURES, ()))
-        # Of the design and of the test.
-        self.objects = stack.to(printer.device)
+        pictures = (inputs or {}).get(PICTURES, ())
+        stack = object_stack(objects, imaging.object_px, pictures).to(printer.device)
+        self.objects, self.tested = stack[: len(imaging.objects)], stack[len(imaging.objects) :]
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
@@ -188,27 +188,24 @@ class ComputationalLensTask(LensTask):
         """The error of the objects after Richardson-Lucy."""
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
-        objects = self.objects[: len(imaging.objects)]
-        image = record(objects, kernel, imaging, _DESIGN_NOISE_SEED)
+        image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
         estimate = richardson_lucy(image, kernel, imaging.iterations)
         if imaging.loss == "smooth-l1":
-            error = smooth_l1_loss(estimate, objects, beta=SMOOTH_BELOW)
+            error = smooth_l1_loss(estimate, self.objects, beta=SMOOTH_BELOW)
         else:
-            error = (estimate - objects).abs().mean()
+            error = (estimate - self.objects).abs().mean()
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
         """Also those of the images of test objects; ``expected_um`` is by default the print."""
-        imaging = self.settings.imaging
         with torch.no_grad():
             psf, design_psf = (self.bench(height_um if one is None else one) for one in (None, expected_um))
-        tested = imaging_score(psf, design_psf, self.objects[len(imaging.objects) :], imaging)
+        tested = imaging_score(psf, design_psf, self.tested, self.settings.imaging)
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
         """Also the errors of black images."""
-        tested = self.objects[len(self.settings.imaging.objects) :]
-        return super().baselines() | {"black image": black_images(tested)}
+        return super().baselines() | {"black image": black_images(self.tested)}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
