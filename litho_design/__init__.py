@@ -1,4 +1,6 @@
-"""Diffractive optics designed through a frozen model of the printer, scored, and exported as its files."""
+"""Design diffractive optics through a frozen model of the printer, score them, and export them for the
+printer.
+"""
 
 from typing import TYPE_CHECKING
 

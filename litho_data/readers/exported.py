@@ -1,4 +1,4 @@
-"""Files that the design package wrote for a printer, read back as levels by the sidecar beside each."""
+"""Read files that the design package wrote for a printer back as levels, with the help of their sidecars."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STL_HEADER_BYTES = 80
 
 
 def export_of(file: Path) -> dict[str, Any]:
-    """What the design package wrote about an exported file; empty for other files.
+    """The sidecar that the design package wrote for an exported file; empty for other files.
 
     Raises:
         InputError: the sidecar belongs to another file.

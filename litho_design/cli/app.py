@@ -56,7 +56,7 @@ def score(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design as models print it, as an AFM measured it, or as a camera saw it.
+    """Score a design as printed by models, as measured by an AFM, or as seen by a camera.
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
@@ -98,7 +98,7 @@ def export(
         bool, typer.Option("--marks", help="also print an F (orientation) and a flat witness beside it")
     ] = False,
 ) -> None:
-    """Write the layout for the printer, with the sidecar that gives it heights and size.
+    """Write a file of the layout for the printer, with a sidecar that states heights and size.
 
     Example: litho-design export hologram --format stl --out files
     """

@@ -222,7 +222,7 @@ def compare(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design with every arm, print with every judge: the design-to-manufacturing gap.
+    """Design with every arm and print with every judge, to measure the design-to-manufacturing gap.
 
     Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
     """

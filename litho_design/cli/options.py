@@ -1,4 +1,4 @@
-"""Options made from the fields of the settings, so that every setting is stated in one place."""
+"""Make options from the fields of the settings, so every setting is stated in one place."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def takes_settings(
 def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of the fields of some records, and pass it one of each by name.
 
-    None is passed for a record of whose options none is given.
+    The command gets None for a record if none of its options is given.
     """
     found = {
         part: {name: leaf_of(field, f"{part}.{name}") for name, field in kind.__pydantic_fields__.items()}
@@ -202,7 +202,7 @@ def as_toml(settings: BaseModel) -> str:
 
 
 def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
-    """One option for a setting that one or several presets have."""
+    """Make one option for a setting of one or several presets."""
     leaf, kind = same[0], same[0].kind
     if get_origin(kind) is UnionType:
         kind = get_args(kind)[0]
@@ -218,7 +218,7 @@ def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
 
 
 def _listed(leaf: Leaf, value: Any) -> Any:
-    """The numbers of an option that takes several, separated by commas; other values as they are."""
+    """Format the values of an option; several numbers are separated by commas."""
     if get_origin(leaf.kind) is not tuple:
         return value
     try:
@@ -228,7 +228,7 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """What an option is; options begin in lower case, but in a file of settings the text starts a line."""
+    """Description of a setting: in lower case for an option, capitalised in a file of settings."""
     return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
 
 

@@ -94,7 +94,7 @@ def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
 
 
 def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
-    """Fields of the sidecar that only a design knows; none without one."""
+    """Fields of the sidecar that come from a design; empty without one."""
     if folder is None or design is None:
         return {}
     shared = {name: getattr(design, name) for name in _OF_DESIGN}

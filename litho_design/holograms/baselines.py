@@ -1,4 +1,4 @@
-"""Scores to compare a hologram's with, on the same grid: of a black image, and of ideal elements."""
+"""Baseline scores of a hologram on the same grid: of a black image, and of ideal elements."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Power on the signal {T > 0.5} of the phase of most power that is found from a print (size, size).
+    """Power on the signal {T > 0.5} of a phase that is optimised for this power from a print (size, size).
 
-    u <- exp(j arg P^H S P u), with S the signal and one phase per pixel: because P^H S P is positive, no step
-    lowers the share, so the result is never below the print's own.
+    Each step is u <- exp(j arg P^H S P u), with S the signal and one phase per pixel. P^H S P is positive, so
+    no step lowers the share, and the result is never below the print's share.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)

@@ -1,4 +1,4 @@
-"""A plain descent of a few free numbers, for yardsticks that no printer limits."""
+"""Plain gradient descent of a few free numbers, for baselines without a printer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def descended(
     iterations: int,
     project: Callable[[], object] = lambda: None,
 ) -> tuple[T, float]:
-    """What ``loss`` returned beside its lowest value over some steps of Adam, and that value.
+    """Minimise ``loss`` by Adam; returns the second result of the best step, and its loss.
 
     Args:
         free: the numbers to change, in place.

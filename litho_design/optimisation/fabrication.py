@@ -1,4 +1,4 @@
-"""What a model has hardly seen, as a penalty in the loss: levels and steps rare in its training layouts."""
+"""Penalty on levels and steps that are rare in a model's training layouts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Fabrication(Record):
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """By how much a layout exceeds twice the tails of a model's training layouts, in levels.
+    """The excess of a layout over twice the tails of a model's training layouts, in levels.
 
     For every k, three shares are compared: of pixels at level k or lower, of pixels at k or higher, and of
     neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the

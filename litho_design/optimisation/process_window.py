@@ -1,4 +1,4 @@
-"""Process window: prints and optics that differ from the model, drawn at random."""
+"""Process window: random prints and optics that differ from the model."""
 
 from __future__ import annotations
 
@@ -160,7 +160,8 @@ def measure_yield(
     modelled: Mapping[str, float],
     errors: Collection[str] = (),
 ) -> Yield:
-    """How many drawn prints pass, that is, keep all figures shared with the print as modelled close to it.
+    """The share of drawn prints that pass, because their figures stay close to those of the print as
+    modelled.
 
     Args:
         errors: figures that are better when lower.

@@ -1,4 +1,4 @@
-"""The processes that share an element: those that torchrun started, or this one alone."""
+"""The processes that share an element: those started by torchrun, or only this one."""
 
 from __future__ import annotations
 

@@ -162,7 +162,9 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Whole levels (size, size): gain * height above the lowest point + zero, within the levels."""
+        """Whole levels (size, size) of gain * (height above the lowest point) + zero, limited to the
+        printable levels.
+        """
         layout = self.settings.layout
         level = gain * (self.target - self.target.amin()) / layout.level_height_um + zero
         return self.cells(self.cells.average(level).round().clamp(0, layout.levels - 1))
@@ -178,7 +180,7 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The task's arrays, and the error that remains even with real levels, which no layout avoids."""
+        """The task's arrays, and the error that remains even with real levels, a lower limit for layouts."""
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 

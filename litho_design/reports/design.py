@@ -127,7 +127,7 @@ def _panels(
         limit = 2 * float(np.std(error)) + 1e-9
         maps = {
             "error, offset free": error - error.mean(),
-            "the part that no layout prints": 1000 * np.load(folder / UNPRINTABLE_FILE),
+            "the part that no layout can print": 1000 * np.load(folder / UNPRINTABLE_FILE),
         }
         return [first, [Panel(*one, side, "nm", "RdBu_r", -limit, limit) for one in maps.items()]]
     behind = "behind the predicted print", task.display(seen), window
@@ -138,7 +138,7 @@ def _panels(
 
 
 def _add_scores(page: Page, design: Design, task: Task) -> None:
-    """The scores of a design beside those of its baselines on the same grid."""
+    """Add the scores of a design and of its baselines on the same grid."""
     baselines = design.baselines or {}
     thick = {} if design.thick is None else {"print, thick element": design.thick}
     page.table(
@@ -165,7 +165,7 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
 
 
 def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
-    """How many random prints pass, and how good they are."""
+    """Add the yield of random prints and their figures."""
     window, errors = task.settings.window, task.errors
     draws = task.window_scores(print_um, window.yield_draws)
     passed = measure_yield(draws, design.predicted, errors)

@@ -92,7 +92,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """How much worse or better than expected, in the figure that compares holograms."""
+    """The difference from the expectation, in the figure that compares holograms."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

@@ -1,4 +1,4 @@
-"""From the scans of a sheet to a dataset, a model with its card, a closed loop and a comparison."""
+"""Evaluate the scans of a sheet: a dataset, a model with its card, a closed loop and a comparison."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BASE = "physics"
 
 
 def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
-    """Turn a sheet's scans into a model of the printer, what it lacks, and the hologram's two images.
+    """Learn a model of the printer from a sheet's scans, find what it lacks, and compare both holograms.
 
     Args:
         sheet: folder of ``new_sheet``, with the scans in it.

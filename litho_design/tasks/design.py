@@ -35,7 +35,7 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device, and duration including interrupted runs."""
+    """Command, software, device and duration of a run, including interrupted runs."""
 
     device: str
     threads: int
@@ -57,7 +57,7 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """What a task finds out about its levels and their print; ``thick``: figures as a thick element."""
+    """Findings of a task about its levels and their print; ``thick``: figures as a thick element."""
 
     tiling: TilingCheck | None = None
     out_of_distribution: OutOfDistribution | None = None

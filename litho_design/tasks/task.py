@@ -1,4 +1,4 @@
-"""A task: what light should do behind a printed element. Holograms and lenses are tasks; write your own."""
+"""The interface of a task: what light should do behind a printed element."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ class Task:
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """What the record of a design says about its levels and their print; ``folder`` has the arrays."""
+        """Findings for the record about levels and their print; ``folder`` contains the arrays."""
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(
@@ -221,12 +221,12 @@ class Task:
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores on the same grid to compare a design's with; by default those of a flat plate."""
+        """Baseline scores on the same grid, by default those of a flat plate."""
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """What is seen, as reports show it: images over their brightest value, side by side in a square."""
+        """What is seen, for reports: images divided by their brightest value, side by side in a square."""
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
         tiles = np.zeros((side * side, *images.shape[1:]))
@@ -240,7 +240,9 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Draws of the process window in the loss with their benches; the print as modelled without draws."""
+        """Draws of the process window in the loss, with their benches; without draws, the print as
+        modelled.
+        """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
         return [(draw, self.search_bench(draw.optics)) for draw in drawn] or [
@@ -262,8 +264,8 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models, it is their worst loss plus their disagreement; with samples of the process
-        window, the risk over them; then the penalty on what the model has hardly seen is added.
+        With several models it is their worst loss plus their disagreement; with samples of the process window
+        it is the risk over them. The penalty on rare levels and steps is added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []

@@ -1,4 +1,4 @@
-"""Design with every arm and print with every judge: the design-to-manufacturing gap in one folder."""
+"""Measure the design-to-manufacturing gap: design with every arm and print with every judge."""
 
 from __future__ import annotations
 

@@ -88,10 +88,10 @@ def train(
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("also train on the locked scans; then no scan is left to judge by", "--use-lock-box"),
+        option("also train on the locked scans; then no scan is left for a test", "--use-lock-box"),
     ] = False,
 ) -> None:
-    """Train a model on all scans but the locked ones; resumable.
+    """Train a model on all scans except the locked ones; resumable.
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
@@ -166,7 +166,7 @@ def benchmark(
     folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
-        option("fit only so many; all by default", min=1),
+        option("number of folds to fit; all by default", min=1),
     ] = None,
     policy: PolicyOption = None,
     background: SharedOption = None,
@@ -301,7 +301,7 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "what causes the effects of undetermined role, for all of them or for one; repeatable",
+            "cause of effects of undetermined role, for all of them or for NAME; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,
@@ -315,7 +315,7 @@ def freeze(
 
 
 def _attribution(given: Sequence[str]) -> Any:
-    """One side for all effects, or sides by name."""
+    """Parse one side for all effects, or sides by name."""
     if len(given) == 1 and "=" not in given[0]:
         return given[0]
     if wrong := [text for text in given if "=" not in text]:
@@ -331,7 +331,7 @@ def main() -> None:
 
 
 def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
-    """Settings of a training: the options that were given, and those of ``--set``."""
+    """Collect the settings of a training from the given options and ``--set``."""
     found = assigned(words or ())
     if twice := sorted(found.keys() & options.keys()):
         raise InputError("--set", got=f"{twice[0]}, which an option sets", wanted="another setting")

@@ -1,4 +1,4 @@
-"""`litho-models noise`: what no model of the printer can predict."""
+"""`litho-models noise`: the error that no model of the printer can predict."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One frozen model on a dataset: ``evaluation.json`` and a report."""
+"""Evaluate one frozen model on a dataset: ``evaluation.json`` and a report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,10 +41,10 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    A model of these prints, trained on this store or on another one built from the same raw files, is not
-    scored on locked scans unless ``open_lock_box`` asks for it. Locked are the scans that this store locks
-    and those that were locked when the model was made. A model of other prints is scored on all scans. The
-    result says which scans were locked, and whether any of them was scored.
+    If the model was trained on these prints (on this store or another one from the same raw files), locked
+    scans are not scored unless ``open_lock_box`` is set. Scans are locked by this store, or were locked when
+    the model was made. A model of other prints is scored on all scans. The result states which scans were
+    locked, and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -54,7 +54,7 @@ def evaluate(
         background: ``training`` adds the background in the model's card to the predictions (the default), and
             ``none`` does not (the default for films). A card without a background, or with one for fields of
             another size, adds none, and the result says so.
-        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
+        noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors.
         scan_ids: score exactly these scans, even locked ones.
         extrapolate: accept layouts beyond the model's calibrated range.
         open_lock_box: also score the locked scans of the prints that the model was trained on.

@@ -1,6 +1,6 @@
-"""Where a benchmark keeps its fits: for each its predictions of held-out scans, record and diagnostics.
+"""The cache of a benchmark's fits, with predictions of held-out scans, record and diagnostics.
 
-Each (model, fold) is a folder of its own, named by the hash of everything that decides it.
+Each (model, fold) has its own folder, named by the hash of everything that determines the fit.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from litho_models.splits.folds import Fold
 
 
 class FitDiagnostics(Record):
-    """Errors of one fitted model on its own scans and on those held out.
+    """Errors of one fitted model on its training scans and on held-out scans.
 
     All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
     that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
@@ -51,7 +51,7 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(Record):
-    """One fit: what it saw and what it cost; errors in nm, None if the model has no rounds.
+    """The record of one fit: scans, cost and errors in nm; None for a model without training steps.
 
     ``at_bounds`` maps each fitted value on a bound of its range to that bound.
     """
@@ -74,14 +74,14 @@ class FitRecord(Record):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """One fit and its heights (ny, nx) of the held-out scans, µm; fitted only if it is not in the cache.
+    """Return a fit and its heights (ny, nx) of the held-out scans, µm, from the cache or newly fitted.
 
     Args:
-        measured: learn the measurement model from a first fit, fit again to the training scans freed of it,
-            and learn it again from the second fit.
+        measured: learn the measurement model from a first fit, remove it from the training scans, fit again,
+            and learn the measurement model again.
 
     Raises:
-        InputError: a kept fit that cannot be read.
+        InputError: a cached fit that cannot be read.
     """
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
@@ -97,7 +97,7 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Training scans freed of the measurement model that is learned with this model's predictions."""
+    """Training scans without the measurement model that is learned from this model's predictions."""
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -106,7 +106,7 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """What a fit expects of a scan: the print (ny, nx), µm, and what its training scans have in common."""
+    """The expected scan: the print (ny, nx), µm, and what the training scans share."""
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)

@@ -1,4 +1,4 @@
-"""``evaluation.json`` of one frozen model, ``benchmark.json`` of many fits, and two of them side by side."""
+"""The records ``evaluation.json`` and ``benchmark.json``, and the comparison of two of them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Benchmark(Result):
 
 @dataclass(frozen=True)
 class ScoredResult:
-    """What two results must agree on to be compared, and their scores by model."""
+    """The facts that two results must share to be compared, and their scores by model."""
 
     path: Path
     protocol: dict[str, object]
@@ -83,8 +83,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     difference means that the first is better.
 
     Raises:
-        InputError: files that cannot be read, different data, folds, scans or nuisances, or a model that
-            was trained on scored scans beside one that was not.
+        InputError: files that cannot be read; different data, folds, scans or nuisances; or a model that was
+            trained on scored scans, compared with one that was not.
     """
     import pandas as pd
 
@@ -110,7 +110,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def read_scored(path: str | Path) -> ScoredResult:
-    """Read a benchmark or an evaluation; of a folder, the result inside it.
+    """Read a benchmark or an evaluation, from its file or folder.
 
     Raises:
         InputError: neither of the two.
@@ -158,6 +158,6 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """A hash by its first digits, which are enough to see that it differs."""
+    """The first digits of a hash, which are enough to show a difference."""
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

@@ -1,4 +1,4 @@
-"""What a killed run needs to go on: weights, optimiser moments, the best weights, the history."""
+"""Checkpoints of a training: weights, optimiser moments, best weights, history."""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from litho_models.simulator import Simulator
 
 
 class RoundRecord(Record):
-    """One round of training; the validation error is None where no scans were set aside."""
+    """One round of training; the validation error is None without validation scans."""
 
     step: int
     training_mae_nm: float
@@ -60,7 +60,9 @@ class TrainingState:
         file.write_bytes(buffer.getvalue())
 
     def load(self, file: Path, history: list[RoundRecord]) -> None:
-        """The inverse of ``save``; the file can hold tensors and numbers only, and nothing in it is run."""
+        """The inverse of ``save``. The file can contain only tensors and numbers, and nothing in it is
+        run.
+        """
         weights, self.best, moments = torch.load(file, map_location="cpu", weights_only=True)
         self.model.load_state_dict(weights)
         self.optimiser.load_state_dict(moments)
@@ -69,10 +71,10 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Read what an earlier call kept in ``folder``, whose files appear whole or not at all.
+    """Read the files of an earlier call in ``folder``, which are always written as a whole.
 
     Raises:
-        InputError: a file is missing or was damaged since.
+        InputError: a missing or damaged file.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Crops of scans with their surroundings: which ones, and how they are cut."""
+"""Choose crops of scans, and cut them with their surroundings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# For its gradient a network keeps hundreds of bytes per pixel of a crop.
+# Pixels per pass, because a network keeps hundreds of bytes per pixel for its gradient.
 _PASS_PX = 256**2
 
 
@@ -43,7 +43,7 @@ def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: in
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """The windows of one optimiser step; a function of seed and step, so a resumed run sees the same."""
+    """The windows of one optimiser step, which depend only on seed and step, so resumed runs are equal."""
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
     random = np.random.default_rng([config.seed, step])

@@ -1,4 +1,4 @@
-"""A frozen model as design calls it: fixed weights, its geometry and calibrated range checked at the door."""
+"""A frozen model for design, with fixed weights, and checks of geometry and calibrated range."""
 
 from __future__ import annotations
 

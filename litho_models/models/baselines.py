@@ -1,4 +1,4 @@
-"""Baselines, from the layout itself to linear features in closed form: what every model must beat."""
+"""Baselines that every model must beat, from the layout itself to linear features in closed form."""
 
 from typing import ClassVar
 
@@ -117,7 +117,7 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """One blur (a pair: along y, along x), cut to the pixels farther than ``reach_px`` from the edge."""
+    """One blur (or a pair along y, along x), without pixels within ``reach_px`` of the edge."""
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
     rows, columns = (
@@ -138,7 +138,7 @@ class LinearConfig(SimulatorConfig):
 class Linear(Simulator):
     """H = w · φ(M): Gaussian blurs, second to fourth power of one blur, its squared slopes, and 1.
 
-    The slopes along y and x have their own weights: the two axes of a print need not behave alike.
+    Slopes along y and x have separate weights, because the two axes of a print may differ.
     """
 
     name = "linear"

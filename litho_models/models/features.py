@@ -1,4 +1,4 @@
-"""Models linear in many features of the layout: how far blurs, slopes and products go without a network."""
+"""Models that are linear in many features of the layout, such as blurs, slopes and products."""
 
 from abc import ABC, abstractmethod
 from itertools import combinations_with_replacement
@@ -37,7 +37,7 @@ class FeaturesConfig(SimulatorConfig):
 
 
 class OfField(ABC):
-    """What features of a field have in common: blurs, displacements, and how far they reach."""
+    """Common parts of features: blurs, displacements, and their reach."""
 
     config: Any
     pitch_um: float
@@ -45,10 +45,10 @@ class OfField(ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int:
-        """How far features reach."""
+        """Receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """The smallest field that has features, namely those of one pixel."""
+        """The smallest field, which gives the features of one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -69,10 +69,10 @@ class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
     φ: blurs with their cubes and the products of each pair; slopes along y and x at several blurs, their
-    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps up to
-    them; blurs along one axis; how steep the surroundings are along each axis. Sizes |∂x| and |∂y| are
-    separate features because a microscope's lines make the two axes differ.
-    The weights are found in closed form, see ``litho_models.fitting.ridge``.
+    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps to them;
+    blurs along one axis; steepness of the surroundings along each axis. The sizes |∂x| and |∂y| are separate
+    features, because a microscope's lines make the two axes differ. The weights are found in closed form, see
+    ``litho_models.fitting.ridge``.
     """
 
     name = "features"
@@ -179,8 +179,8 @@ class RandomFeaturesConfig(FeaturesConfig):
 class RandomFeatures(Features):
     """``Features`` plus tanh(V z + c), z the standardised simple features, V and c random and fixed.
 
-    A network with one hidden layer that is not trained (random features, Rahimi and Recht 2008): what lies
-    beyond products of two features can be learned, still in closed form.
+    This is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It learns
+    more than products of two features, still in closed form.
     """
 
     name = "random-features"
@@ -214,6 +214,6 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels ``step`` above, below, left and right of those farther than ``step`` from the edge."""
+    """The pixels ``step`` above, below, left and right of all pixels farther than ``step`` from the edge."""
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

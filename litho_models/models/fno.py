@@ -1,9 +1,9 @@
 """FNO: the Fourier neural operator, the paper's learned simulator without physics inside.
 
 arXiv:2309.17343, appendix "Fourier Neural Operator": the two-dimensional operator of Li et al. 2020
-(arXiv:2010.08895) with 12 x 12 modes and width 24. A layer adds a product in Fourier space, which sees
-the whole image, to a local convolution. It is periodic in the image and its modes count periods per
-image, so it answers differently for another image size: ``default`` runs it on tiles of one size.
+(arXiv:2010.08895) with 12 x 12 modes and width 24. A layer adds a product in Fourier space, which sees the
+whole image, to a local convolution. The operator is periodic in the image and its modes count periods per
+image, so its result depends on the image size. ``default`` therefore runs it on tiles of one size.
 """
 
 from typing import Any, ClassVar, Self
@@ -17,7 +17,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Ninety times the paper's number, 0.5 GB of weights: a card may not ask more of the machine that loads it.
+# Largest number of weights that a card may request: ninety times the paper's, 0.5 GB.
 _MOST_MATRIX_ENTRIES = 30_000_000
 
 
@@ -27,14 +27,14 @@ class FnoConfig(SimulatorConfig):
     modes: tuple[PositiveInt, PositiveInt] = (12, 12)
     width: int = Field(24, ge=1, le=1024, description="channels of the layers")
     projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
-    # 1 x 1 in the paper: what the kept modes do not resolve can then only be mapped pixel by pixel.
+    # 1 x 1 in the paper, which can only map detail beyond the kept modes pixel by pixel.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
     padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
     padding_px: int = Field(0, ge=0, le=4096, description="zeros at bottom and right of an image of any size")
     tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
     overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
-    # Start as the layout and learn what differs; the paper's network starts at random.
+    # Start as the layout and learn the difference; the paper's network starts at random.
     starts_as_layout: bool = True
 
     _PUBLISHED: ClassVar[dict[str, Any]] = {
@@ -61,8 +61,8 @@ class FnoConfig(SimulatorConfig):
 class Fno(Simulator):
     """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), no gelu after the last.
 
-    P lifts each pixel to ``width`` channels, Q maps them to a height through one hidden layer. With
-    ``starts_as_layout`` this is added to M, and is zero at the start. Where the config has a tile,
+    P lifts each pixel to ``width`` channels, and Q maps them to a height through one hidden layer. With
+    ``starts_as_layout`` this height is added to M and starts at zero. Where the config has a tile,
     ``interior`` is the height of one tile, taken as periodic, and the field is blended from tiles.
     """
 
@@ -114,7 +114,7 @@ class Fno(Simulator):
         return layout_um + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
-        """The last layers: a height (n,) from features (n, width)."""
+        """Apply the last layers: a height (n,) from features (n, width)."""
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
@@ -140,7 +140,8 @@ class PeriodicConvolution(nn.Conv2d):
 
 
 class SpectralConvolution(nn.Module):
-    """A matrix over channels for each of the lowest frequencies: v̂'(k) = W(k) v̂(k), all others zero.
+    """A product v̂'(k) = W(k) v̂(k) with a matrix over channels at each of the lowest frequencies; others are
+    zero.
 
     The weights are real, (sign of k_y, in, out, modes y, modes x, real and imaginary part), so that
     they can be stored and cast like any other parameter.

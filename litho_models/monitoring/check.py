@@ -1,4 +1,4 @@
-"""``litho-models check``: does a printer still behave as its frozen model says, and when to look again."""
+"""``litho-models check``: test whether a printer still behaves as its frozen model says."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ def check(
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
 ) -> Check:
-    """Compare new prints with those that a model was made of; write ``check.json``, a report and tables.
+    """Compare new prints with a model's reference prints; write ``check.json``, a report and tables.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -51,7 +51,7 @@ def check(
         say(f"checking {len(dataset)} scans of {dataset.name}")
         found = gather(frozen, dataset, reference, new)
         parameters = frozen.card["parameters"]
-        # The error on prints that the model has seen is too small to compare new prints with.
+        # The error on the model's training prints is too small for a comparison with new prints.
         optimistic = wording.too_optimistic(found.reference, parameters)
         judged = judge(
             found.reference,

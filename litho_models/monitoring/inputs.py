@@ -1,4 +1,4 @@
-"""What is checked against what: the scans of a store, and a reference from a store, a print or a card."""
+"""Collect the scans to check, and the reference from a store, other prints or a card."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
-    """Figures of reference and new scans, what was left out, and the reference in words.
+    """Figures of reference and new scans, excluded scans, and a description of the reference.
 
-    ``between``: the new prints were made among the reference ones.
+    ``between``: whether the new prints were made between reference prints.
     """
 
     reference: list[ScanFigures]
@@ -109,7 +109,7 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """The scans at the dose that most reference scans have: another dose changes the gain on purpose."""
+    """Scans at the dose of most reference scans; other doses change the gain on purpose."""
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:
         return found

@@ -1,7 +1,7 @@
-"""The noise of prints that were not made to measure it, from the out-of-fold residuals of a model.
+"""Estimate the noise of ordinary prints from the out-of-fold residuals of a model.
 
-Two estimates, too high rather than too low: what differs between like surroundings (``estimated_floor``), and
-the roughness where the layout is flat, so that a model has little to get wrong.
+There are two upper estimates: the differences between similar surroundings (``estimated_floor``), and the
+roughness where the layout is flat and model errors are small.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ _FEWEST_PIXELS = 1000
 class FlatLevel(Record):
     """Residual where the layout is flat, pixels of one level: rms and mean absolute value, nm.
 
-    Each scan is freed of policy ``full+rows``. ``ci95_nm``: interval of σ over prints.
+    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm``: interval of σ over prints.
     """
 
     level: int
@@ -37,10 +37,10 @@ class FlatLevel(Record):
 
 
 class NoiseBudget(Record):
-    """What the prints say about their own noise; both parts are upper estimates.
+    """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
-    ``flat_texture`` is of the same pixels of all scans, freed of policy ``full``: lines are left in.
+    ``flat_texture`` is the texture of the same pixels after policy ``full``, so with line offsets.
     """
 
     # Older results also have the length of correlation.
@@ -54,7 +54,7 @@ class NoiseBudget(Record):
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Both estimates from the residuals of one model on scans that it had not seen."""
+    """Make both estimates from the residuals of one model on held-out scans."""
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))

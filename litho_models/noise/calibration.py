@@ -1,4 +1,4 @@
-"""Is a stated spread right? Judged on prints that it was not fitted on."""
+"""Test the calibration of a stated spread on prints outside its fit."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -12,7 +12,13 @@ from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.residuals import Residuals
-from litho_models.noise.spread_scores import COVERAGE_LEVELS, GAUSSIAN, Tails
+from litho_models.noise.spread_scores import (
+    COVERAGE_LEVELS,
+    GAUSSIAN,
+    Tails,
+    normalised_calibration_error,
+    sparsification_error,
+)
 from litho_models.noise.variance import (
     PLACES,
     VarianceModel,
@@ -26,31 +32,38 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
-# Roughness is correlated over ten pixels and more, so that more pixels tell nothing new.
+# Roughness is correlated over ten pixels and more, so more pixels add no information.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
-# Older results have further figures: of ensembles, of the order of errors, and promises for whole scans.
+_MEANS = ("nll", "crps_nm", "ence", "ause")
+# Older results have further figures: of ensembles, and promises for whole scans.
 _OLDER = ConfigDict(extra="ignore")
 
 
 class ScanCalibration(Record):
-    """One scan: likelihood (lower is better), coverage at the levels stated, rms of r/σ."""
+    """One scan: likelihood and CRPS (lower is better), coverage at the levels stated, rms of r/σ.
+
+    ``ence`` and ``ause`` are shares, 0 is best (see ``spread_scores``).
+    """
 
     model_config = _OLDER
 
     scan: str
     nll: float
+    crps_nm: float
     coverage: list[float]
     standardised_rms: float
+    ence: float
+    ause: float
 
 
 class Calibration(Record):
-    """A description of the spread and how well it holds on prints that it was not fitted on.
+    """A description of the spread, and its calibration on prints outside its fit.
 
     Args:
         name: constant, or by covariates.
-        nll, coverage: means over scans; ``levels`` are what the coverages should be.
+        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
         pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
     """
 
@@ -59,16 +72,19 @@ class Calibration(Record):
     name: str
     levels: list[float]
     nll: float
+    crps_nm: float
     coverage: list[float]
     worst_scan_coverage_90: float
     pit: list[float]
     scans: list[ScanCalibration]
+    ence: float
+    ause: float
 
 
 class SigmaBin(Record):
-    """Pixels within one range of one covariate: measured and predicted spread, and how far the latter holds.
+    """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
 
-    Coverage at 68 and 95 % with 95 % intervals over prints.
+    Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group.
     """
 
     model_config = _OLDER
@@ -83,6 +99,8 @@ class SigmaBin(Record):
     coverage_68_ci95: tuple[float, float] | None
     coverage_95: float
     coverage_95_ci95: tuple[float, float] | None
+    ence: float
+    ause: float
 
 
 class SpreadAnalysis(Record):
@@ -113,10 +131,9 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit a constant and a covariate spread without each print, and judge both on the prints left out.
+    """Fit a constant and a covariate spread without each print, and judge both on that print.
 
-    With fewer than three prints scans are left out instead. The tails are chosen with the scale, on the
-    prints that both are fitted to.
+    With fewer than three prints, scans are left out instead. Tails and scale are fitted together.
 
     Raises:
         InputError: fewer than three scans.
@@ -165,7 +182,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 def calibrate(
     name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
-    """Judge a stated spread on every scan; pixels first, then scans."""
+    """Judge a stated spread on every scan, and average over scans."""
     rows, histograms = [], []
     for scan, residual, (scale, tails) in zip(scans, residuals_nm, stated, strict=True):
         scored = np.isfinite(residual)
@@ -176,15 +193,18 @@ def calibrate(
             ScanCalibration(
                 scan=scan.id,
                 nll=float(-tails.log_likelihood(r, s).mean()),
+                crps_nm=float(tails.crps(r, s).mean()),
                 coverage=[float(tails.covered(r, s, level).mean()) for level in COVERAGE_LEVELS],
                 standardised_rms=rms(r / s) / tails.sd,
+                ence=normalised_calibration_error(r, tails.sd * s),
+                ause=sparsification_error(r, s),
             )
         )
     shares = np.array([row.coverage for row in rows])
     return Calibration(
         name=name,
         levels=list(COVERAGE_LEVELS),
-        nll=float(np.mean([row.nll for row in rows])),
+        **{name: float(np.mean([getattr(row, name) for row in rows])) for name in _MEANS},
         coverage=shares.mean(axis=0).tolist(),
         worst_scan_coverage_90=float(shares[:, COVERAGE_LEVELS.index(0.9)].min()),
         pit=np.mean(histograms, axis=0).tolist(),
@@ -198,7 +218,7 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """All pixels, each level, and ranges of equal count of what else the spread depends on."""
+    """Bins of all pixels, of each level, and of equal counts of every other covariate."""
     used = [np.isfinite(residual) for residual in residuals_nm]
 
     def pooled(maps: Sequence[Array]) -> Array:
@@ -231,6 +251,8 @@ def _bins(
             pixels=int(mine.sum()),
             rms_nm=rms(residual[mine]),
             predicted_nm=rms(sigma[mine]),
+            ence=normalised_calibration_error(residual[mine], sigma[mine]),
+            ause=sparsification_error(residual[mine], sigma[mine]),
             **coverage,
         )
 

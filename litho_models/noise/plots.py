@@ -40,9 +40,9 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Height, roughness and readability against dose; shaded where steps are lost."""
-    figure = new_figure(10.5, 3.2)
-    left, middle, right = figure.subplots(1, 3)
+    """Heights of the levels, and readability against dose; shaded where steps are lost."""
+    figure = new_figure(8.5, 3.2)
+    left, right = figure.subplots(1, 2)
     doses = np.array([row.dose for row in found.rows])
     for row in found.rows:
         levels = [entry.level for entry in row.levels]
@@ -56,18 +56,14 @@ def dose(found: DoseMatrix) -> Figure:
         )
     left.set(xlabel="level", ylabel="printed height above the lowest level, nm")
     left.legend(fontsize=8, title="dose", title_fontsize=8)
-    middle.plot(doses, [row.roughness_nm for row in found.rows], "o-", color="#c23b22", ms=4)
-    middle.set_ylabel("roughness, nm")
     right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
     right.axhline(READABLE_AT, color="#9aa7b5", ls="--", lw=1)
-    right.set_ylabel("worst step over σ")
-    for axes in (middle, right):
-        axes.set_xlabel("relative dose")
-        axes.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
-        for row in found.rows:
-            if row.lost_low or row.lost_high:
-                width = np.ptp(doses) / max(1, len(doses) - 1) / 2
-                axes.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
+    right.set(xlabel="relative dose", ylabel="worst step over σ")
+    right.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
+    width = np.ptp(doses) / max(1, len(doses) - 1) / 2
+    for row in found.rows:
+        if row.lost_low or row.lost_high:
+            right.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
     return figure
 
 

@@ -19,11 +19,11 @@ from litho_models.scoring.records import Prediction
 
 
 class Residuals(NamedTuple):
-    """What a model leaves of each scan: measured minus predicted, nm, NaN where not scored.
+    """Residuals of a model on each scan: measured minus predicted, nm, NaN where not scored.
 
     Attributes:
         maps_um: the map that the model expects of each scan, (ny, nx).
-        residuals_nm: freed of the terms of ``protocol``.
+        residuals_nm: residuals without the terms of ``protocol``.
         held_out: whether the model had not seen any of the scans.
     """
 

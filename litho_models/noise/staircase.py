@@ -1,4 +1,4 @@
-"""Step prints: where the treads are, how high the steps, and how well neighbours can be told apart."""
+"""Step prints: treads, heights of steps, and readability of neighbouring levels."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from litho_models.scoring.statistics import rms
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
-# A tread narrower than this share of the field is an edge, not a tread.
+# Narrowest tread, as a share of the field.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
@@ -46,7 +46,7 @@ class StepPrint(Record):
     Args:
         tread_sigma_nm: rms deviation within the treads, one plane for all removed.
         tread_mae_nm: mean absolute deviation from the median of each tread.
-        resolvable_step_nm: smallest step of which single pixels are told apart: 3.92 σ.
+        resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -115,8 +115,8 @@ def step_print(
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
     """The axis of a staircase and the pixels at which a new tread starts, ascending.
 
-    The profile of medians is cut into constant pieces with the least squared error. Each edge has a
-    price: it has to save what an edge between two narrowest treads that differ by half a level saves.
+    The profile of medians is fitted by constant pieces with the least squared error plus a price per edge.
+    The price is the saving by an edge between two of the narrowest treads that differ by half a level.
 
     Raises:
         InputError: no edge along either axis.
@@ -165,7 +165,7 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Columns of each tread, off its edges by the guard, but never by more than a third of its width."""
+    """Columns of each tread without a guard at its edges, which is at most a third of its width."""
     limits = [0, *edges_px, shape[1]]
     treads = []
     for start, stop in pairwise(limits):
@@ -175,7 +175,7 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
-    """Heights freed of the one tilt that all treads share; NaN off the treads."""
+    """Heights without the common tilt of all treads; NaN outside the treads."""
     ny, nx = height_um.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     terms = [np.zeros((ny, nx)) for _ in treads]

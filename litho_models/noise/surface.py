@@ -1,4 +1,4 @@
-"""How rough one surface is: bare substrate, flat print, or the treads of a staircase."""
+"""Roughness of one surface: bare substrate, flat print, or the treads of a staircase."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -19,7 +19,7 @@ class SurfaceNoise(Record):
     """Deviation of a surface from its background.
 
     Args:
-        background: what was removed: the mean (``offset``) or a polynomial of second degree.
+        background: the removed background: the mean (``offset``) or a polynomial of second degree.
         sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm`` its standard uncertainty from the
             number of independent heights in the field.
         mae_nm: mean absolute deviation from the median, as measured: no distribution assumed.
@@ -38,9 +38,9 @@ class SurfaceNoise(Record):
 
 
 class PrintNoise(Record):
-    """What the print adds to substrate and microscope: ``print² = flat² − substrate²``, nm.
+    """Roughness of the print alone: ``print² = flat² − substrate²``, nm.
 
-    ``print_nm`` is None where the flat print is not rougher than the substrate.
+    ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -66,7 +66,7 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
     if finite.sum() < 64:
         raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
     sigma = amplitude_parameters(deviation).sq_nm
-    # Unmeasured pixels enter the correlation as the mean: they hold no information.
+    # Unmeasured pixels have no information, so they enter the correlation as the mean.
     filled = np.where(finite, deviation, deviation[finite].mean())
     independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
     centred = deviation[finite] - np.median(deviation[finite])

@@ -1,4 +1,4 @@
-"""What the roughness of flat surfaces looks like: lines or not, in which direction, periodic or not.
+"""Texture of flat surfaces: whether it has lines, in which direction, and with which period.
 
 The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
 """
@@ -40,8 +40,8 @@ class Lines(Record):
 
     Args:
         along: ``x`` (rows) or ``y`` (columns).
-        share: part of the surface's variance that is in the means of the lines. A surface without lines has
-            a share too: compare the two axes.
+        share: part of the surface's variance in the means of the lines. A surface without lines also has a
+            share, so compare the two axes.
         period: the strongest one of these means; None below 64 lines.
     """
 
@@ -117,6 +117,6 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Mean of each line; one without a measured pixel counts as the mean of all."""
+    """Mean of each line; lines without a measured pixel get the mean of all."""
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

@@ -1,4 +1,4 @@
-"""Whole fields of any size: tiles that are exact where the model has a receptive radius, else blended."""
+"""Predict whole fields of any size in tiles, exact for models with a receptive radius, otherwise blended."""
 
 from collections.abc import Callable
 
@@ -32,7 +32,7 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
 def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
     """Height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x - 2r), µm.
 
-    Gradients flow to the layout; computed in tiles of at most ``tile_px``, which changes nothing.
+    Gradients flow to the layout. Tiles of at most ``tile_px`` do not change the result.
 
     Raises:
         InputError: a model without a receptive radius, or a layout that has no interior.

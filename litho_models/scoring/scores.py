@@ -1,4 +1,4 @@
-"""One routine that scores every model: predictions of scans in, one validated record out."""
+"""Score a model: from predictions of scans to one validated record."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms of their own: only their errors depend on a smooth background.
+# Policies without smooth terms, the only ones whose errors depend on a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 
@@ -29,8 +29,8 @@ def score_model(
 
     Args:
         name: name of the model.
-        scans: the scans; ``predictions``: what the model expects of each.
-        protocol: what scans are freed of, and whether the predictions have backgrounds.
+        scans: the scans; ``predictions``: the model's prediction of each.
+        protocol: terms to remove from scans, and whether the predictions include backgrounds.
 
     Raises:
         InputError: predictions that are not finite, or a scan too small for the policies.

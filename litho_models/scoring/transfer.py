@@ -1,4 +1,4 @@
-"""How an error depends on the level and on the spatial frequency."""
+"""The dependence of an error on level and spatial frequency."""
 
 from collections.abc import Sequence
 from typing import Any
