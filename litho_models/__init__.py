@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from litho_models.evaluation.benchmark import benchmark as benchmark
     from litho_models.evaluation.evaluate import evaluate as evaluate
     from litho_models.evaluation.results import compare as compare
+    from litho_models.fitting.patches import PatchDataset as PatchDataset
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
     from litho_models.frozen.files import load_frozen as load_frozen

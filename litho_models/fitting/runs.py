@@ -1,6 +1,7 @@
 """Run folders: train a model on a store, resumable."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
+from litho_models.fitting.processes import processes_of_torchrun
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.models import model_class
@@ -61,7 +63,8 @@ def train(
 ) -> TrainingRun:
     """Train a model on a store into a run folder; the same call again continues a killed run.
 
-    The scans of the lock box are left out unless ``use_lock_box``.
+    The scans of the lock box are left out unless ``use_lock_box``. Under ``torchrun`` the processes share
+    each step, and the first one writes.
 
     Args:
         store: dataset store; ``model``: name of a model; ``out``: run folder.
@@ -84,8 +87,12 @@ def train(
         "config": config.model_dump(mode="json"),
         "lock_box": locked,
     }
-    with growing_folder(folder, TrainingRun.FILE_NAME, facts):
-        say(f"training {model} on {len(used)} scans")
+    with (
+        processes_of_torchrun() as first,
+        growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext(),
+    ):
+        if first:
+            say(f"training {model} on {len(used)} scans")
         fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
         record = TrainingRun(
             run=run_info([config.seed], len(used)),
@@ -97,6 +104,8 @@ def train(
             at_bounds=fitted.model.at_bounds,
             **facts,
         )
+        if not first:
+            return record
         heights = [predict_scan(fitted.model, scan) for scan in used]
         save_frozen(
             fitted.model,

@@ -2,7 +2,8 @@
 
 Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
 scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
-and step, so an interrupted run continues to the same result.
+and step, so an interrupted run continues to the same result. Processes share the crops of each step and add
+their gradients. Between rounds each process does the same.
 """
 
 import math
@@ -23,6 +24,7 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
+from litho_models.fitting.processes import add_over_processes, own_device, rank_and_count
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
@@ -49,7 +51,7 @@ def train_network(
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = own_device()
     warn_where_slower(_precision(config), device.type)
     model.to(device)
     state = TrainingState(model, _optimiser(model, config))
@@ -83,7 +85,7 @@ def train_network(
         if not HEIGHT_UM.holds([one / NM_PER_UM for one in errors_nm]):
             raise _diverged(model, last)
         state.record(record)
-        if checkpoints is not None:
+        if checkpoints is not None and rank_and_count()[0] == 0:
             checkpoints.save(state)
     state.restore_best()
     return state.history
@@ -136,13 +138,17 @@ def _step(
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
+    rank, count = rank_and_count()
+    own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    for some in in_passes(batch, device):
+    # A process without a crop of its own has the gradients of one with weight 0.
+    for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
-        share = len(some) / len(batch)
+        share = len(some) / len(batch) if own else 0.0
         (share * loss).backward()
         sums += share * means
+    add_over_processes([sums, *(value.grad for value in state.model.parameters() if value.grad is not None)])
     state.optimiser.step()
     return sums
 

@@ -21,7 +21,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
-from litho_models.frozen import zoo
+from litho_models.frozen import hub, zoo
 from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.models import model_class
@@ -88,7 +88,7 @@ def load_frozen(
     """Load a frozen model: eval mode, weights without gradients, effects of the printer included.
 
     Args:
-        source: what ``save_frozen`` wrote, or ``zoo:NAME``.
+        source: what ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for one that ``push`` shared.
         device: where to put it.
         extrapolate: accept heights beyond the calibrated range.
 
@@ -107,6 +107,20 @@ def load_frozen(
         model = EffectChain(simulator, card.process_effects)
     frozen = FrozenSimulator(model, card, file_sha256(path / CARD_FILE), extrapolate)
     return frozen.to(device)
+
+
+def push(source: str | Path, repository: str, *, private: bool = False) -> str:
+    """Share a frozen model on the Hugging Face Hub; returns the address that ``load_frozen`` takes.
+
+    Args:
+        source: as for ``load_frozen``.
+        repository: ``owner/name``; made if need be, private or not.
+
+    Raises:
+        InputError: what ``load_frozen`` refuses, a repository that refuses, or no huggingface_hub.
+    """
+    load_frozen(source)
+    return hub.upload(zoo.model_folder(source), repository, private=private)
 
 
 def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:

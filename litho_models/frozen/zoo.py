@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.errors import unknown_name
+from litho_models.frozen import hub
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
 PREFIX = "zoo:"
@@ -38,16 +39,18 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
-    """The folder of a model, from a path or ``zoo:NAME``.
+    """The folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
 
     Args:
         source: what the user typed.
         other: further names that the caller accepts, for the message.
 
     Raises:
-        InputError: no such folder, or no such model in the zoo.
+        InputError: no such folder, no such model in the zoo, or one that cannot be fetched.
     """
     text = str(source)
+    if text.startswith(hub.ADDRESS):
+        return hub.fetched(text)
     if text.startswith(PREFIX):
         return folder(text.removeprefix(PREFIX))
     if not Path(source).is_dir():

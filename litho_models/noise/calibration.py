@@ -12,7 +12,13 @@ from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.residuals import Residuals
-from litho_models.noise.spread_scores import COVERAGE_LEVELS, GAUSSIAN, Tails
+from litho_models.noise.spread_scores import (
+    COVERAGE_LEVELS,
+    GAUSSIAN,
+    Tails,
+    normalised_calibration_error,
+    sparsification_error,
+)
 from litho_models.noise.variance import (
     PLACES,
     VarianceModel,
@@ -30,19 +36,26 @@ _FOLDS = 5
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
-# Older results have further figures: of ensembles, of the order of errors, and promises for whole scans.
+_MEANS = ("nll", "crps_nm", "ence", "ause")
+# Older results have further figures: of ensembles, and promises for whole scans.
 _OLDER = ConfigDict(extra="ignore")
 
 
 class ScanCalibration(Record):
-    """One scan: likelihood (lower is better), coverage at the levels stated, rms of r/σ."""
+    """One scan: likelihood and CRPS (lower is better), coverage at the levels stated, rms of r/σ.
+
+    ``ence`` and ``ause`` are shares, 0 is best (see ``spread_scores``).
+    """
 
     model_config = _OLDER
 
     scan: str
     nll: float
+    crps_nm: float
     coverage: list[float]
     standardised_rms: float
+    ence: float
+    ause: float
 
 
 class Calibration(Record):
@@ -50,7 +63,7 @@ class Calibration(Record):
 
     Args:
         name: constant, or by covariates.
-        nll, coverage: means over scans; ``levels`` are what the coverages should be.
+        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
         pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
     """
 
@@ -59,16 +72,19 @@ class Calibration(Record):
     name: str
     levels: list[float]
     nll: float
+    crps_nm: float
     coverage: list[float]
     worst_scan_coverage_90: float
     pit: list[float]
     scans: list[ScanCalibration]
+    ence: float
+    ause: float
 
 
 class SigmaBin(Record):
     """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
 
-    Coverage at 68 and 95 % with 95 % intervals over prints.
+    Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group.
     """
 
     model_config = _OLDER
@@ -83,6 +99,8 @@ class SigmaBin(Record):
     coverage_68_ci95: tuple[float, float] | None
     coverage_95: float
     coverage_95_ci95: tuple[float, float] | None
+    ence: float
+    ause: float
 
 
 class SpreadAnalysis(Record):
@@ -175,15 +193,18 @@ def calibrate(
             ScanCalibration(
                 scan=scan.id,
                 nll=float(-tails.log_likelihood(r, s).mean()),
+                crps_nm=float(tails.crps(r, s).mean()),
                 coverage=[float(tails.covered(r, s, level).mean()) for level in COVERAGE_LEVELS],
                 standardised_rms=rms(r / s) / tails.sd,
+                ence=normalised_calibration_error(r, tails.sd * s),
+                ause=sparsification_error(r, s),
             )
         )
     shares = np.array([row.coverage for row in rows])
     return Calibration(
         name=name,
         levels=list(COVERAGE_LEVELS),
-        nll=float(np.mean([row.nll for row in rows])),
+        **{name: float(np.mean([getattr(row, name) for row in rows])) for name in _MEANS},
         coverage=shares.mean(axis=0).tolist(),
         worst_scan_coverage_90=float(shares[:, COVERAGE_LEVELS.index(0.9)].min()),
         pit=np.mean(histograms, axis=0).tolist(),
@@ -230,6 +251,8 @@ def _bins(
             pixels=int(mine.sum()),
             rms_nm=rms(residual[mine]),
             predicted_nm=rms(sigma[mine]),
+            ence=normalised_calibration_error(residual[mine], sigma[mine]),
+            ause=sparsification_error(residual[mine], sigma[mine]),
             **coverage,
         )
 

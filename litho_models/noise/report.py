@@ -151,7 +151,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     page.table(
         [row for one in found.calibrations for row in _covered(one, [one], {"levels", "pit", "scans"})],
-        "Means over scans; NLL in nats of nm.",
+        "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
         "calibration.csv",
         digits=3,
     )

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import norm
 from scipy.stats import t as student
 
@@ -17,7 +18,12 @@ from litho_models.noise.calibration import Stated, _bins, analyse_spread, calibr
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import repeated_prints
 from litho_models.noise.residuals import Residuals
-from litho_models.noise.spread_scores import GAUSSIAN, Tails
+from litho_models.noise.spread_scores import (
+    GAUSSIAN,
+    Tails,
+    normalised_calibration_error,
+    sparsification_error,
+)
 from litho_models.noise.staircase import READABLE_AT, _piecewise_constant, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import (
@@ -47,12 +53,28 @@ def drawn(freedom, size, random):
 # --- closed forms -------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("freedom", [np.inf, 4.0, 10.0])
+@pytest.mark.parametrize(("residual", "sigma"), [(0.0, 1.0), (1.3, 0.7), (-4.0, 2.5)])
+def test_crps_is_the_integral_that_defines_it(residual, sigma, freedom):
+    below, _ = quad(lambda x: student.cdf(x / sigma, freedom) ** 2, -np.inf, residual, limit=200)
+    above, _ = quad(lambda x: student.sf(x / sigma, freedom) ** 2, residual, np.inf, limit=200)
+    # Quadrature is good to 1e-8.
+    assert float(Tails(freedom).crps(np.array(residual), sigma)) == pytest.approx(below + above, abs=1e-6)
+
+
+def test_crps_becomes_the_absolute_error_without_spread():
+    residual = np.array([-3.0, 0.5, 8.0])
+    assert np.allclose(GAUSSIAN.crps(residual, 1e-9), np.abs(residual), atol=1e-8)
+
+
 @pytest.mark.parametrize("freedom", [np.inf, 6.0])
-def test_the_likelihood_is_best_at_the_true_spread(random, freedom):
+def test_the_scores_are_best_at_the_true_spread(random, freedom):
     tails = Tails(freedom)
     residual = 3.0 * drawn(freedom, 40_000, random)
-    at = [tails.log_likelihood(residual, sigma).mean() for sigma in (2.4, 3.0, 3.6)]
-    assert at[1] > max(at[0], at[2])
+    for score in (lambda r, s: -tails.log_likelihood(r, s), tails.crps):
+        at = [score(residual, sigma).mean() for sigma in (2.4, 3.0, 3.6)]
+        assert at[1] < at[0]
+        assert at[1] < at[2]
     assert np.allclose(tails.log_likelihood(residual, 2.0), student.logpdf(residual / 2, freedom) - np.log(2))
     assert tails.sd == pytest.approx(student.std(freedom))
 
@@ -63,6 +85,38 @@ def test_coverage_of_the_right_shape_is_its_level(level, freedom, random):
     residual = 2.0 * drawn(freedom, 100_000, random)
     # Binomial sd √(p(1 − p)/n) ≤ 0.0016.
     assert Tails(freedom).covered(residual, 2.0, level).mean() == pytest.approx(level, abs=0.007)
+
+
+def test_ence_is_the_relative_error_of_sigma(random):
+    sigma = np.repeat([1.0, 2.0, 5.0, 9.0], 1000)
+    # Residuals of ± σ have that rms in every bin.
+    residual = sigma * random.choice([-1.0, 1.0], sigma.size)
+    assert normalised_calibration_error(residual, sigma) == pytest.approx(0, abs=1e-12)
+    assert normalised_calibration_error(residual, 2 * sigma) == pytest.approx(0.5)
+    assert normalised_calibration_error(residual, sigma / 2) == pytest.approx(1.0)
+    # The mean of σ over its four values is right for none: the one bin of a constant hides it.
+    constant = np.full(sigma.size, np.sqrt(np.mean(sigma**2)))
+    assert normalised_calibration_error(residual, constant) == pytest.approx(0, abs=1e-12)
+    # Of a Gaussian the rms of n pixels has the relative sd 1/√(2n), so its mean deviation is 1/√(πn); ten
+    # bins of 4,000 know that to a quarter.
+    steady = random.uniform(1, 9, 40_000)
+    gaussian = steady * random.normal(0, 1, steady.size)
+    assert normalised_calibration_error(gaussian, steady) == pytest.approx(
+        1 / np.sqrt(4000 * np.pi), abs=1 / np.sqrt(4000 * np.pi)
+    )
+
+
+def test_ause_of_uniform_errors_has_closed_forms(random):
+    error = (np.arange(10_000) + 0.5) / 10_000
+    residual = random.permutation(error) * random.choice([-1.0, 1.0], error.size)
+    size = np.abs(residual)
+    # The lowest share q of errors uniform on 0 ... 1 has q times the mean, the highest 2 − q times: areas of
+    # 1/2 and 3/2; any order of equal σ has 1. Sums over 10,000 pixels stand for the integrals.
+    assert sparsification_error(residual, size) == 0
+    assert sparsification_error(residual, np.full(error.size, 3.0)) == pytest.approx(0.5, abs=2e-4)
+    assert sparsification_error(residual, 1 / size) == pytest.approx(1.0, abs=2e-4)
+    # Units and any growing function of σ do not matter.
+    assert sparsification_error(1e3 * residual, size**2) == pytest.approx(0, abs=1e-12)
 
 
 # --- surfaces -----------------------------------------------------------------------------------
@@ -426,6 +480,8 @@ def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not(freedo
     assert (found.variance.freedom or np.inf) >= min(freedom, 30)
     constant, by_covariates = found.calibrations
     assert by_covariates.nll < constant.nll - 0.02
+    assert by_covariates.crps_nm < constant.crps_nm
+    assert by_covariates.ause < constant.ause
     for level, share in zip(by_covariates.levels, by_covariates.coverage, strict=True):
         # 110,000 pixels: 0.2 %; the fit on ten scans of 5,000 pixels adds as much.
         assert share == pytest.approx(level, abs=0.01)
@@ -449,8 +505,11 @@ def test_errors_half_as_large_again_as_stated_are_so_for_all_groups_and_scans(ra
     assert [row.rms_nm for row in groups] == pytest.approx([1.5 * row.predicted_nm for row in groups])
     # All of them lie between one and two σ.
     assert {(row.coverage_68, row.coverage_95) for row in groups} == {(0, 1)}
-    for row in calibrate("exact", scans, errors, stated).scans:
-        assert row.standardised_rms == pytest.approx(1.5)
+    judged = calibrate("exact", scans, errors, stated).scans
+    assert [row.standardised_rms for row in judged] == pytest.approx([1.5] * 3)
+    for row in [*groups, *judged]:
+        # The order of the errors is that of σ.
+        assert (row.ence, row.ause) == pytest.approx((0.5, 0), abs=1e-9)
 
 
 def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():

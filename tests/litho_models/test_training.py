@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +13,8 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_models.fitting import TrainingConfig, fit, fit_with_record
-from litho_models.fitting.checkpoint import CheckpointFolder
+from litho_models.fitting import stochastic as network
+from litho_models.fitting.checkpoint import CheckpointFolder, TrainingState
 from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
 from litho_models.fitting.small_models import fit_small_model
@@ -20,7 +24,7 @@ from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
-from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um
+from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
 pytestmark = pytest.mark.numerics
 
@@ -379,6 +383,60 @@ def test_one_cycle_rises_to_the_rate_and_falls_to_a_thousandth():
 def test_bad_requests_are_refused(call):
     with pytest.raises(InputError):
         call()
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
+    monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
+    scans = make_scans(3, size_px=64)
+    # Unequal weights of the crops: a mean of means would show.
+    scans[0].valid[:, :40] = False
+    config = TrainingConfig(batch=4, crop_px=32)
+    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
+
+    def of_process(rank, count):
+        """What one process adds to the sum over processes."""
+        added = []
+        monkeypatch.setattr(network, "rank_and_count", lambda: (rank, count))
+        monkeypatch.setattr(
+            network, "add_over_processes", lambda own: added.extend(one.clone() for one in own)
+        )
+        torch.manual_seed(0)
+        model = build_model("pbl", **SMALL_NETS)
+        state = TrainingState(model, torch.optim.SGD(model.parameters()))
+        network._step(state, targets, config, 0, torch.device("cpu"))
+        return torch.cat([one.flatten() for one in added])
+
+    one = of_process(0, 1)
+    many = sum(of_process(rank, count) for rank in range(count))
+    # Four crops are summed in another order: float32 rounding of the largest term.
+    torch.testing.assert_close(many, one, rtol=0, atol=1e-5 * float(one.abs().max()))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("count", [2, 5])
+def test_several_processes_give_the_loss_curve_of_one(count, tmp_path):
+    from litho_models.fitting.runs import TrainingRun
+
+    store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=64))
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\n"
+        "from litho_models.fitting.runs import train\n"
+        "settings = dict(steps=4, rounds=2, batch=4, crop_px=32, precision='32-true', nuisance='offset')\n"
+        "settings |= dict(validation_scans=2)\n"
+        f"train({str(store)!r}, 'pbl', sys.argv[1], settings=settings)\n"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    subprocess.run([sys.executable, script, tmp_path / "one"], check=True, env=environment)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
+    subprocess.run([*torchrun, script, tmp_path / "many"], check=True, env=environment)
+    one, many = (TrainingRun.read(tmp_path / name).history for name in ("one", "many"))
+    # Gradients are summed in another order: float32 rounding, a few 1e-6 after four steps. The last round is
+    # that of the feature networks on pixels, alike in each process, in hundreds of steps that add to it.
+    for a, b, near in zip(one, many, (1e-4, 1e-4, 2e-2), strict=True):
+        assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=near)
+        assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=near)
 
 
 @pytest.mark.parametrize(("name", "rate"), [("pbl", 1e6), ("fno", 1e3), ("fno", 1e9), ("physics", 1e8)])

@@ -1,0 +1,105 @@
+"""Patches of a store for your own training loop: a PyTorch ``Dataset`` without the lock box."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan, Store, open_store
+from litho_models.fitting.crops import Window, cut
+
+
+class Patch(TypedDict):
+    """One patch: layout with its margin, measured height and which pixels count; its scan and corner."""
+
+    layout_um: Tensor
+    height_um: Tensor
+    valid: Tensor
+    scan: str
+    y_px: int
+    x_px: int
+
+
+class PatchDataset(Dataset[Patch]):
+    """Squares drawn from the scans of a store, each a function of seed and index alone.
+
+    ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
+    sees what lies beyond its edge; ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid``
+    (1, s, s) bool says where it counts. Patches are neither turned nor flipped: the two axes of a print are
+    not alike, and a lag of the beam or of the microscope acts to one side.
+
+    Args:
+        store: dataset store or its path. Locked scans are left out.
+        size_px: side s of a patch; ``margin_px``: m.
+        per_scan: number of patches from each scan.
+        ids: scans to draw from; all that are not locked by default.
+        seed: decides the places.
+
+    Raises:
+        InputError: unknown or locked ids, or a patch that is larger than a scan.
+    """
+
+    def __init__(
+        self,
+        store: str | Path | Store,
+        *,
+        size_px: int = 128,
+        margin_px: int = 32,
+        per_scan: int = 64,
+        ids: Sequence[str] | None = None,
+        seed: int = 0,
+    ):
+        self._scans = _chosen(store if isinstance(store, Store) else open_store(store), ids)
+        self._layouts_um = [scan.layout_um for scan in self._scans]
+        smallest = min(min(scan.shape) for scan in self._scans)
+        if not 1 <= size_px <= smallest:
+            raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the smallest scan")
+        if margin_px < 0 or per_scan < 1:
+            got = f"margin_px {margin_px}, per_scan {per_scan}"
+            raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one per scan")
+        self.size_px, self.margin_px, self.per_scan, self.seed = size_px, margin_px, per_scan, seed
+
+    @property
+    def ids(self) -> list[str]:
+        """The scans that patches are drawn from."""
+        return [scan.id for scan in self._scans]
+
+    def __len__(self) -> int:
+        return self.per_scan * len(self._scans)
+
+    def __getitem__(self, index: int) -> Patch:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        number = index // self.per_scan
+        scan, random = self._scans[number], np.random.default_rng([self.seed, index])
+        y, x = (int(random.integers(length - self.size_px + 1)) for length in scan.shape)
+        window = Window(number, y, x, self.size_px)
+        height_um, valid = cut(scan.height_um, window), cut(scan.usable, window)
+        return Patch(
+            layout_um=_tensor(cut(self._layouts_um[number], window, self.margin_px), np.float32),
+            height_um=_tensor(np.where(valid, height_um, 0), np.float32),
+            valid=_tensor(valid, bool),
+            scan=scan.id,
+            y_px=y,
+            x_px=x,
+        )
+
+
+def _chosen(store: Store, ids: Sequence[str] | None) -> list[PrintedScan]:
+    open_ids = [scan_id for scan_id in store.ids if scan_id not in store.locked_ids]
+    if refused := [scan_id for scan_id in ids or () if scan_id not in open_ids]:
+        got = ", ".join(f"{one} ({'locked' if one in store.locked_ids else 'unknown'})" for one in refused)
+        raise InputError("ids of patches", got=got, wanted="scans of the store that are not locked")
+    wanted = [store.scan(scan_id) for scan_id in (open_ids if ids is None else ids)]
+    if not wanted:
+        raise InputError("patches", got="no scan", wanted="at least one that is not locked")
+    return wanted
+
+
+def _tensor(field: np.ndarray, dtype: type[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(field[None], dtype=dtype))

@@ -1,0 +1,57 @@
+"""Frozen models on the Hugging Face Hub: a repository of three files, fetched or shared."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.errors import InputError
+
+ADDRESS = "hf://"
+_REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*")
+_FILES = ["model.safetensors", "card.json", "README.md"]
+
+
+def fetched(address: str) -> Path:
+    """The folder of a model, fetched unless the cache of huggingface_hub holds it.
+
+    Args:
+        address: ``hf://owner/name``, or ``hf://owner/name@revision``.
+
+    Raises:
+        InputError: no such address or repository, or no huggingface_hub.
+    """
+    repository, _, revision = address.removeprefix(ADDRESS).partition("@")
+    with _hub(repository) as hub:
+        return Path(hub.snapshot_download(repository, revision=revision or None, allow_patterns=_FILES))
+
+
+def upload(folder: Path, repository: str, *, private: bool) -> str:
+    """Make the repository if need be and put the three files of a frozen model into it; its address.
+
+    Raises:
+        InputError: no such address, a repository that refuses, or no huggingface_hub.
+    """
+    repository = repository.removeprefix(ADDRESS)
+    with _hub(repository) as hub:
+        hub.create_repo(repository, private=private, exist_ok=True)
+        hub.upload_folder(repo_id=repository, folder_path=str(folder), allow_patterns=_FILES)
+    return f"{ADDRESS}{repository}"
+
+
+@contextmanager
+def _hub(repository: str) -> Iterator[Any]:
+    """The library; each of its errors becomes one line."""
+    what = f"model {ADDRESS}{repository}"
+    if not _REPOSITORY.fullmatch(repository):
+        raise InputError(what, wanted=f"{ADDRESS}OWNER/NAME")
+    try:
+        import huggingface_hub
+    except ModuleNotFoundError as error:
+        raise InputError(what, got=f"no {error.name}", hint="pip install 'litholoop[hub]'") from None
+    try:
+        yield huggingface_hub
+    # Its own errors, and those of whatever network library it uses.
+    except Exception as error:
+        raise InputError(what, got=str(error).strip().partition("\n")[0]) from error
