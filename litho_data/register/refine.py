@@ -124,8 +124,8 @@ def refine(
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
     """``gram`` of a scan that is already aligned with the topography (ny, nx), NaN where not measured.
 
-    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further`` regressors (ny, nx)
-    follow these.
+    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further``: more regressors (ny,
+    nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)

@@ -216,7 +216,7 @@ def filled(template: Path, **values: object) -> str:
 
 
 def sentences(template: Path, about: str, one: object) -> str:
-    """What a macro of a template says about one thing, in one line."""
+    """Render a macro of a template in one line."""
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
 
