@@ -18,7 +18,9 @@ PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
 
-setup: $(STAMP)    ## make the environment
+setup: $(STAMP)    ## make the environment, and show that it works
+	$(BIN)/litho-models zoo list
+	@echo "it works; next: make demo, or . .venv/bin/activate and litho-design first"
 
 # The pip of the constraints first: the one that comes with Python 3.11 takes three times as long to choose.
 $(STAMP): pyproject.toml constraints.txt

@@ -2,7 +2,7 @@
 
     litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
         --steps 20
-    python -m benchmarks.measured_plan runs/neural-lithography/close-loop runs/neural-lithography/next-print
+    python -m benchmarks.measured_plan runs/neural-lithography/next-print
 
 Everything of the plan but its report goes to the page's results; the tables of the page are written anew.
 """
@@ -18,15 +18,8 @@ from benchmarks.record import publish
 from litho_data.commands.progress import run_script
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
-from litho_models.frozen.card import ModelCard
-from litho_models.frozen.files import load_simulator
-from litho_models.loop.saving import MODEL_FOLDER
 from litho_models.planning.folder import HOLDS
-from litho_models.planning.layouts import as_tensor
-from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
-from litho_models.planning.report import prints_figure
-from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "next-print"
@@ -38,8 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("loop", type=Path, help="closed loop of the measured prints")
-    parser.add_argument("plan", type=Path, help="its plan")
+    parser.add_argument("plan", type=Path, help="plan made from the closed loop of the measured prints")
     given = parser.parse_args()
     plan = NextPrint.read(given.plan)
     shutil.rmtree(RESULTS, ignore_errors=True)
@@ -52,26 +44,18 @@ def main() -> None:
             shutil.copytree(source, RESULTS / name)
         else:
             shutil.copy(source, RESULTS / name)
-    draw(plan, given.loop)
+    draw(plan)
     for name, text in texts(plan).items():
         publish(PAGE, name, text)
 
 
-def draw(plan: NextPrint, loop: Path) -> None:
-    """The layouts of the prints; what each rival of the first question predicts of the first print."""
+def draw(plan: NextPrint) -> None:
+    """The layouts of the prints, side by side."""
     first = {scan.print: scan.id for scan in reversed(plan.scans) if scan.use == "dataset"}
     levels = {
         f"print {name}": read_layout(RESULTS / "layouts" / f"{first[name]}.tif") for name in sorted(first)
     }
     layouts_figure(levels, plan.levels).savefig(RESULTS / "layouts.jpg", dpi=80)
-    open_, card = OpenQuestions.read(loop), ModelCard.read(loop / MODEL_FOLDER)
-    question = next(q for q in open_.questions if len(q.rivals) > 1)
-    printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
-    rivalry = Rivalry(question, load_simulator(loop / MODEL_FOLDER, card), printing, open_.noise)
-    last = [scan for scan in plan.scans if scan.print == "1"][-1]
-    way = Way(last.turned_deg, last.direction, last.tip, last.pixel_size)
-    shown = PlannedPrint(as_tensor(levels["print 1"]), (way,))
-    prints_figure(rivalry, shown).savefig(RESULTS / "rivals.jpg", dpi=80)
 
 
 def texts(plan: NextPrint) -> dict[str, str]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.reports.page import Page
 from litho_models.loop.record import CloseLoop
+from litho_models.loop.report import said
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
@@ -92,8 +93,8 @@ def main() -> None:
     out = arguments.out / name
     steps = plan(out, arguments.dataset)
     seconds = [run(step, f"[{number}/{len(steps)}]") for number, step in enumerate(steps, 1)]
-    page = write_index(out, name, steps, seconds)
-    print(f"\ndone in {sum(seconds) / 60:.1f} min; open {page}")
+    answer, page = write_index(out, name, steps, seconds)
+    print(f"\n{answer}\ndone in {sum(seconds) / 60:.1f} min; open {page}")
 
 
 def plan(out: Path, dataset: str) -> list[Step]:
@@ -220,17 +221,19 @@ def run(step: Step, number: str) -> float:
     return time.monotonic() - started
 
 
-def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> Path:
-    """One page that leads to all the reports."""
+def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
+    """The answer of the demo, and one page that says it and leads to all the reports."""
     import pandas as pd
 
     page = Page(
         f"litholoop: {name}", "From raw scans to a design that was optimised through the learned printer."
     )
     if (out / "fab").exists():
-        tell(page, out)
+        answer = tell(page, out)
     else:
         loop = CloseLoop.read(out / "close-loop")
+        answer = said("verdict", loop)
+        page.verdict(answer)
         rows = {"the base model": loop.error("base"), "what the loop found": loop.error("all")}
         tiles = [
             (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans, one term per scan free")
@@ -245,7 +248,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
         {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
     )
     page.table(table, "0 s: the result was there from an earlier run.", "steps.csv", digits=1)
-    return page.write(out, "index.html")
+    return answer, page.write(out, "index.html")
 
 
 def _spell(command: tuple[str, ...]) -> str:

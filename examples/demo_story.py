@@ -15,7 +15,7 @@ from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.reports.parts import BRIGHTEST
+from litho_design.reports.pictures import BRIGHTEST
 from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
 from litho_models.evaluation.wording import benchmark_verdict
@@ -35,8 +35,8 @@ PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
 IMAGE = {"cmap": "inferno", "vmin": 0.0, "vmax": BRIGHTEST}
 
 
-def tell(page: Page, out: Path) -> None:
-    """Add verdict and cards to the index of a demo in ``out``."""
+def tell(page: Page, out: Path) -> str:
+    """Add verdict and cards to the index of a demo in ``out``; returns the verdict."""
     truth = Truth.read(out / "fab" / "truth")
     loop = CloseLoop.read(out / "close-loop")
     gap = GapResult.read(out / "compare")
@@ -54,7 +54,7 @@ def tell(page: Page, out: Path) -> None:
     assert before is not None
     assert after is not None
     less = 100 * (1 - after.mae_nm / before.mae_nm)
-    page.verdict(
+    answer = (
         f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
         f"{': ' if hit else ''}{' and '.join(hit)}"
         f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
@@ -63,6 +63,7 @@ def tell(page: Page, out: Path) -> None:
         f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it, and "
         f"{psnr['none']:.1f} dB designed without a model. One run, so nothing is said about chance."
     )
+    page.verdict(answer)
     page.heading("1. What was planted")
     told = [f"{get_effect(name).title} ({knob})" for name, knob in planted.items()]
     page.paragraph(f"In the virtual fab, and in no file that the programs read: {'; '.join(told)}.")
@@ -108,6 +109,7 @@ def tell(page: Page, out: Path) -> None:
         page.paragraph(f"Printed by the fab itself, its image has {psnr[arm]:.1f} dB.")
         page.figure(_hologram(out / folder, out / "fab" / "truth"), "Wanted; printed; what the print shows.")
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
+    return answer
 
 
 def _causes(loop: CloseLoop) -> list[FoundEffect]:

@@ -1,4 +1,6 @@
-"""Diffractive optics designed through a frozen model of the printer, scored, and exported as its files."""
+"""Design diffractive optics through a frozen model of the printer, score them, and export them for the
+printer.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -9,9 +11,9 @@ if TYPE_CHECKING:
     from litho_design.exports.files import export as export
     from litho_design.exports.files import import_levels as import_levels
     from litho_design.holograms.settings import hologram_settings as hologram_settings
-    from litho_design.images.photograph import PhotoSource as PhotoSource
+    from litho_design.images.measurements import MeasuredSource as MeasuredSource
+    from litho_design.images.measurements import PhotoSource as PhotoSource
     from litho_design.judging.loaded import load_design as load_design
-    from litho_design.judging.measured import MeasuredSource as MeasuredSource
     from litho_design.lenses.settings import lens_settings as lens_settings
     from litho_design.optimisation.settings import design_settings as design_settings
     from litho_design.printers.source import load_printer as load_printer

@@ -1,4 +1,4 @@
-"""The contract of every model of the printer: layout in, printed height out."""
+"""The interface of every model of the printer, from layout to printed height."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Spot (standard deviation, µm) from which default lengths follow, for layouts of a pitch.
+    """Spot (standard deviation, µm) that sets default lengths for layouts of a pitch.
 
-    It is that of the first printer, unless that is narrower than half a pixel or wider than ten: then the
-    printer is another one, and its spot is taken to be two pixels wide, as that of the first printer was.
+    It is the spot of the first printer if that is between half a pixel and ten pixels wide. Otherwise the
+    printer must be another one, and its spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
     return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """The lengths of a config, from ``set_`` or the defaults, scaled to a pitch; none at scale 1."""
+    """The lengths of a config, from ``set_`` or the defaults, scaled to a pitch; empty at scale 1."""
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
         return {}
@@ -45,15 +45,15 @@ def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: floa
 
 
 class SimulatorConfig(BaseModel):
-    """Geometry that the model is made for, and its variant; subclasses add their hyper-parameters.
+    """Geometry and variant of a model; subclasses add their hyper-parameters.
 
-    ``VARIANT_FIELDS`` says which fields a variant sets; the resulting config is explicit, so that a
-    saved model does not depend on what a variant means later.
+    ``VARIANT_FIELDS`` lists the fields that a variant sets. The config stores their values, so a saved model
+    does not depend on later definitions of a variant.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {}
-    # Defaults that are multiples of the first printer's spot.
+    # Fields whose defaults are multiples of the first printer's spot.
     LENGTHS: ClassVar[tuple[str, ...]] = ()
 
     variant: Variant = "default"
@@ -81,7 +81,9 @@ class SimulatorConfig(BaseModel):
 
 
 class Tile(NamedTuple):
-    """Square on which a model is trained and evaluated; neighbours share ``overlap_px``, blended."""
+    """Square on which a model is trained and evaluated; neighbours overlap by ``overlap_px`` and are
+    blended.
+    """
 
     size_px: int
     overlap_px: int
@@ -90,13 +92,13 @@ class Tile(NamedTuple):
 class Simulator(nn.Module, ABC):
     """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
 
-    A subclass implements ``interior``; what it returns may depend on the layout within ``reach_px`` of a
-    pixel and on nothing else, so that a crop with that margin predicts what the whole field does.
+    A subclass implements ``interior``. A pixel of its result may depend only on the layout within
+    ``reach_px``, so a crop with this margin gives the same height as the whole field.
     """
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # The height is a linear function of the parameters: one Jacobian serves the whole fit.
+    # Whether the height is linear in the parameters, so that one Jacobian serves the whole fit.
     is_linear: ClassVar[bool] = False
 
     def __init__(self, config: SimulatorConfig):
@@ -104,7 +106,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """As in every module, except that what the config fixes is not trained."""
+        """Register a parameter; one that the config fixes is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)
@@ -113,30 +115,30 @@ class Simulator(nn.Module, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int | None:
-        """Receptive radius in pixels; None where a pixel depends on the whole image."""
+        """Receptive radius in pixels; None if a pixel depends on the whole image."""
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model whose result depends on the size of the image; None for all others."""
+        """The tile of a model whose result depends on the size of the image; None for other models."""
         return None
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
         """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm.
 
-        Without a receptive radius the layout is a whole image, or one tile, and the size stays the same.
+        A model without a receptive radius gets a whole image or one tile, and returns the same size.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Height of the whole field; beyond its edge the outermost pixels are continued."""
+        """Height of the whole field, whose outermost pixels are continued beyond the edge."""
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Height of the whole field without its outermost ``border_px``, less than half of it, µm.
+        """Height of the whole field without a border of ``border_px``, µm.
 
-        A model without a receptive radius overrides this if it can save the cost of the border; for any
-        other, ``predict_inside`` computes only what is needed.
+        A model without a receptive radius overrides this if it can save the cost of the border. For other
+        models ``predict_inside`` computes only what is needed.
         """
         return crop_border(self(layout_um), border_px)
 
@@ -146,24 +148,26 @@ class Simulator(nn.Module, ABC):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Ranges of fitted values, each by the parameter (one raw number) behind it; any other is free."""
+        """Ranges of fitted values, by the name of their parameter (one raw number); other parameters are
+        free.
+        """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Values that have reached a bound of their range, and that bound."""
+        """Values on a bound of their range, with that bound."""
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
         return {name: bound for name, bound in bounds.items() if bound is not None}
 
     @property
     def pitch_um(self) -> float:
-        """Lateral sampling that the model is made for, µm."""
+        """Pixel pitch of the model, µm."""
         return self.config.pitch_um
 
     @property
     def reach_um(self) -> float | None:
-        """Receptive radius in µm; None where a pixel depends on the whole image."""
+        """Receptive radius in µm; None if a pixel depends on the whole image."""
         return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
 
     @property
@@ -173,10 +177,10 @@ class Simulator(nn.Module, ABC):
 
 
 def is_small(model: nn.Module) -> bool:
-    """Whether trainable numbers are few (``SMALL_PARAMETERS``) enough for a column of derivatives each.
+    """Whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
 
-    A small model is fitted by least squares (unless the recipe is the paper's), and in the loop together with
-    the effects; any other is trained by stochastic gradient, and the loop takes it as it is.
+    Small models are fitted by least squares (except by the paper's recipe), and in the loop together with the
+    effects. Other models are trained by stochastic gradient, and the loop does not refit them.
     """
     return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 

@@ -122,7 +122,6 @@ MISTAKES: dict[str, dict[str, str]] = {
         "a pixel that is no number": "litho-design export layout.npy --pitch-um nan --out new",
         "a level of no height": "litho-design export layout.npy --level-height-um 0 --out new",
         "a scan without end": "litho-design export design --format gwl --gwl-speed 1e300 --out new",
-        "write fields anywhere": "litho-design score design --judge printer --stitch-sigma-um inf --out new",
         "levels without end": "litho-design hoe --model none --level-height-um 1e300 --out new",
         "gains of any size": "litho-design hoe --model none --gain-sd 1e15 --out new",
         "steps without end": "litho-design hoe --model none --learning-rate 1e300 --out new",

@@ -22,6 +22,7 @@ from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.virtual_fab import simulate
+from litho_data.virtual_fab.films import simulate_films
 from litho_design import (
     compare,
     correct,
@@ -33,6 +34,10 @@ from litho_design import (
     lens_settings,
 )
 from litho_design.reliefs.settings import relief_settings
+from litho_design.sheets.new import new_sheet
+from litho_design.workflows.score import score
+from litho_models.boards.board import judge_board, new_board
+from litho_models.boards.records import Answer
 from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.evaluate import evaluate
@@ -41,6 +46,7 @@ from litho_models.frozen.exporting import export_model
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze as freeze_model
 from litho_models.loop import bases, closing
+from litho_models.monitoring import check
 from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
@@ -83,6 +89,10 @@ def _scans(folder: Path) -> None:
 
 def simulate_prints(folder: Path) -> None:
     simulate(folder / "out", count=1, size_px=40)
+
+
+def films(folder: Path) -> None:
+    simulate_films(folder / "out", "e-beam", count=2, size_px=64)
 
 
 def layouts(folder: Path) -> None:
@@ -135,6 +145,26 @@ def score_model(folder: Path) -> None:
 
 def noise(folder: Path) -> None:
     analyse_noise(folder / "prints.zarr", folder / "out")
+
+
+def _ten_scans(folder: Path) -> None:
+    write_store(folder / "prints.zarr", make_scans(10, 48))
+
+
+def check_prints(folder: Path) -> None:
+    check("zoo:physics", folder / "prints.zarr", folder / "out", new=["4"])
+
+
+def board(folder: Path) -> None:
+    new_board(folder / "out", trials=1, n_scans=6, size_px=128)
+
+
+def _board(folder: Path) -> None:
+    new_board(folder / "board", trials=2, n_scans=6, size_px=128)
+
+
+def judge(folder: Path) -> None:
+    judge_board(folder / "board", folder / "out", lambda store, place: Answer())
 
 
 def _planted(folder: Path) -> None:
@@ -207,6 +237,15 @@ def export_design(folder: Path) -> None:
     export(folder / "design", "png16", folder / "out")
 
 
+def score_design(folder: Path) -> None:
+    score(folder / "design", folder / "out", judges=["zoo:physics"])
+
+
+def sheet(folder: Path) -> None:
+    made = hologram_settings(changes=_SMALL_OPTICS)
+    new_sheet(folder / "out", model="zoo:physics", settings=made, format="png16", layouts=6, announce=False)
+
+
 def nothing(folder: Path) -> None:
     pass
 
@@ -214,6 +253,7 @@ def nothing(folder: Path) -> None:
 # Per command: what it needs, and itself.
 COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "simulate": (nothing, simulate_prints),
+    "simulate-films": (nothing, films),
     "masks": (nothing, layouts),
     "build": (_campaign, build),
     "import-pairs": (_pairs, build_pairs),
@@ -226,6 +266,9 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "benchmark": (_scans, score_models),
     "evaluate": (_scans, score_model),
     "noise": (_scans, noise),
+    "check": (_ten_scans, check_prints),
+    "board-new": (nothing, board),
+    "board-judge": (_board, judge),
     "close-loop": (_planted, loop),
     "close-loop-nested": (_planted, loop_nested),
     "next-print": (_closed, plan),
@@ -235,6 +278,8 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "first": (nothing, first_hologram),
     "compare": (nothing, comparison),
     "export-design": (_designed, export_design),
+    "score": (_designed, score_design),
+    "sheet-new": (nothing, sheet),
 }
 
 

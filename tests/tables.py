@@ -45,6 +45,23 @@ def require_tables_equal_record(
             assert any(_agrees(one, stated) for one in objects), f"{file.name}, row {number}: {stated}"
 
 
+def require_figures_by_column(file: Path, columns: Mapping[str, Mapping[str, float]]) -> None:
+    """Fail where a cell is not the figure that its row names, of the print that its column names.
+
+    Args:
+        columns: by their titles the figures of each print.
+    """
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert rows, f"{file.name} is empty"
+    assert set(rows[0]) - {"name", "meaning"} == set(columns), f"{file.name} has other columns"
+    for row in rows:
+        for title, figures in columns.items():
+            value = figures.get(row["name"], math.nan)
+            same = row[title] == "" if math.isnan(value) else _same(value, row[title])
+            assert same, f"{file.name}: {row['name']} of {title}"
+
+
 def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Each object of a record with the plain fields of those that it is part of."""
     if isinstance(value, list):

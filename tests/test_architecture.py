@@ -36,7 +36,7 @@ ROOMS = {
     ),
     "litho_design": (
         "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
-        "judging", "large", "exports", "reports", "workflows", "sheets", "cli",
+        "large", "judging", "exports", "reports", "workflows", "sheets", "cli",
     ),
 }  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,12 +44,31 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
         announce=False,
     )
     page = Page("demo")
-    tell(page, tmp_path)
+    answer = tell(page, tmp_path)
     text = page.write(tmp_path, "index.html").read_text("utf-8")
     assert re.findall(r"<h2[^>]*>\s*(\d)\. ", text) == list("123456")
     assert text.count("<figure") == 6
     # elliptical-psf is among the effects found on the measured prints, whose result stands in here.
-    assert "2 effects were hidden in the prints, and the loop found 1 of them" in text
+    assert "2 effects were hidden in the prints, and the loop found 1 of them" in answer
+    assert answer in text
     assert "Planted and not found: write-order-memory" in text
     for link in re.findall(r'href="(compare/[^"]+)"', text):
         assert (tmp_path / link).is_file()
+
+
+@pytest.mark.long
+def test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page(tmp_path):
+    """What ``make demo`` runs in its environment."""
+    recipe = re.search(
+        r"^demo:.*\n\t\$\(BIN\)/python (-m examples\.demo --out) ", (ROOT / "Makefile").read_text(), re.M
+    )
+    command = [sys.executable, *recipe[1].split(), str(tmp_path / "runs")]
+    home = {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | home, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    answer, last = done.stdout.strip().splitlines()[-2:]
+    assert re.search(
+        r"the error went from [\d.]+ to [\d.]+ nm, .* has [\d.]+ dB when this printer prints it", answer
+    )
+    page = Path(re.fullmatch(r"done in [\d.]+ min; open (.+)", last)[1])
+    assert answer in page.read_text("utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import os
 import re
 import shutil
@@ -16,7 +17,7 @@ import litho_data
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-EXTRA_MODULES = ("torch", "skimage", "safetensors", "lightning")
+EXTRA_MODULES = ("torch", "skimage", "safetensors")
 
 WITHOUT_EXTRAS = f"""
 import importlib.abc, sys
@@ -92,7 +93,7 @@ def test_versions_and_names_agree() -> None:
     assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
     assert litho_data.__version__ == PROJECT["version"]
     core = " ".join(PROJECT["dependencies"])
-    assert not [name for name in ("torch", "lightning", "safetensors") if f"{name}>" in core]
+    assert not [name for name in ("torch", "safetensors") if f"{name}>" in core]
 
 
 def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_path: Path) -> None:
@@ -104,3 +105,91 @@ def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_pat
     page = (tmp_path / "README.md").read_text("utf-8")
     assert [link for link in re.findall(r"\]\(([^)]+)\)", page) if not link.startswith("https://")] == []
     assert "](https://raw.githubusercontent.com/owner/name/v1/docs/results/first/first.jpg)" in page
+
+
+TODAY = datetime.date.today().isoformat()
+# What stands in for the project's Python, which builds, and for those that try the wheel.
+BUILDS = """#!/bin/sh
+case "$1" in -c) echo 9.8.7;; *) mkdir -p dist; touch dist/litholoop-9.8.7-py3-none-any.whl;; esac
+"""
+TRIES = """#!/bin/sh
+[ "$1" = --version ] && exit {known}
+mkdir -p "$3/bin"
+for name in pip litho-data litho-design; do
+  cat >"$3/bin/$name" <<END
+#!/bin/sh
+echo "$name in \\$(basename "\\$PWD"): \\$*" >>"$LOG"
+[ $name != {broken} ]
+END
+  chmod +x "$3/bin/$name"
+done
+"""
+
+
+def released(
+    folder: Path, *, said: str = TODAY, tag: str = "", change: str = "", **of_312: object
+) -> tuple[int, str]:
+    """Exit code and last line of the release of a small project in ``folder``."""
+    files = {
+        ".venv/bin/python": BUILDS,
+        ".gitignore": ".venv/\nbin/\ndist/\nlog\n",
+        "CITATION.cff": f"date-released: {said}\n",
+        "CHANGELOG.md": f"## 9.8.7 ({said})\n",
+    }
+    for python in ("python3.11", "python3.12", "python3.13"):
+        asked = {"known": 0, "broken": "none"} | (of_312 if python == "python3.12" else {})
+        files[f"bin/{python}"] = TRIES.format(**asked)
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, "utf-8")
+        (folder / name).chmod(0o755)
+    (folder / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "release", folder / ".ci")
+    names = {f"GIT_{role}_{what}": "a@b" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+    path = f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | names | {"PATH": path, "LOG": str(folder / "log")}
+    tagging = [["tag", tag]] if tag else []
+    for words in (["init", "--quiet"], ["add", "."], ["commit", "--quiet", "--message", "all"], *tagging):
+        subprocess.run(["git", *words], cwd=folder, env=environment, check=True)
+    if change:
+        (folder / change).write_text("")
+    done = subprocess.run([folder / ".ci" / "release"], env=environment, capture_output=True, text=True)
+    return done.returncode, (done.stdout + done.stderr).strip().splitlines()[-1]
+
+
+def tags(folder: Path) -> list[str]:
+    asked = ["git", "tag", "--list"]
+    return subprocess.run(asked, cwd=folder, capture_output=True, text=True, check=True).stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None or os.name == "nt", reason="needs a Unix shell")
+def test_a_release_tries_its_wheel_with_every_python_before_it_is_tagged(tmp_path: Path) -> None:
+    assert released(tmp_path) == (0, "v9.8.7 is tagged; push the tag to publish it")
+    assert tags(tmp_path) == ["v9.8.7"]
+    tried = (tmp_path / "log").read_text("utf-8").splitlines()
+    assert [line.split(":")[0].split()[0] for line in tried] == 3 * ["pip", "litho-data", "litho-design"]
+    assert all("dist/litholoop-9.8.7-py3-none-any.whl[design]" in line for line in tried[::3])
+    assert tried[2::3] == 3 * ["litho-design in empty: first --out first"]
+    supported = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
+    named = " ".join(f"python{one}" for one in supported)
+    assert f"pythons=({named})" in (ROOT / ".ci" / "release").read_text("utf-8")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None or os.name == "nt", reason="needs a Unix shell")
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ({"change": "new.py"}, "not committed"),
+        ({"tag": "v9.8.7"}, "tagged already"),
+        ({"said": "2020-02-02"}, "into CITATION.cff"),
+        ({"known": 127}, "python3.12 does not run"),
+        ({"broken": "litho-design"}, ""),
+        ({"broken": "pip"}, ""),
+    ],
+    ids=lambda one: str(one),
+)
+def test_a_release_that_is_not_ready_is_not_tagged(tmp_path: Path, fault: dict, said: str) -> None:
+    code, line = released(tmp_path, **fault)
+    assert code != 0
+    assert said in line
+    assert tags(tmp_path) == ([fault["tag"]] if "tag" in fault else [])

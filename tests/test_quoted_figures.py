@@ -144,10 +144,10 @@ def quadrants(record: dict[str, Any]) -> list[str]:
     affine, _, seven = record["bounds"][:3]
     prints = np.array(list(affine["datum_of_prints_nm"].values()))
     return [
-        f"zeros of {affine['datum_size']['mean_nm']:.0f} nm in the mean",
+        f"this bound averages {affine['datum_size']['mean_nm']:.0f} nm",
         f"{prints[:4].mean():.0f} nm too high in the four prints",
         f"{-prints[4:].mean():.0f} nm too low in the two",
-        f"zeros of {seven['datum_size']['mean_nm']:.0f} nm on prints they were not fitted to, and errors of "
+        f"the bound is {seven['datum_size']['mean_nm']:.0f} nm on prints outside the fit, and the error is "
         f"{seven['mae']['mean_nm']:.0f} nm",
     ]
 

@@ -10,6 +10,7 @@ import pytest
 import litho_data
 import litho_design
 import litho_models
+from tests.test_capabilities import names_in_file
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text("utf-8")
@@ -19,6 +20,34 @@ SMALLER = {
     '"layout.size_px": 256': '"search.iterations": 2, "search.polish_rounds": 0, '
     '"window.yield_draws": 5, "layout.size_px": 64',
 }
+# Commands of the page, of the site's first page and of the tutorials, and what runs each.
+WHEEL = "tests/test_packaging.py::test_the_wheel_designs_a_hologram_from_an_empty_folder"
+RUN_BY = {
+    "make demo": "tests/test_demo.py::test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page",
+    "make test": ".ci/run",
+    "make setup && . .venv/bin/activate": ".ci/run",
+    "make docs": "tests/test_site.py::test_every_page_of_the_site_is_sound_on_every_screen",
+    "litho-design first --out first": WHEEL,
+    "pip install '.[design]'": WHEEL,
+    "pip install .": "tests/test_packaging.py::test_litho_data_makes_and_builds_prints_without_the_extras",
+}
+
+
+def test_every_command_of_the_first_pages_is_run_by_a_test():
+    pages = [ROOT / "README.md", ROOT / "docs" / "README.md", *(ROOT / "docs" / "tutorials").glob("*.md")]
+    text = "".join(page.read_text("utf-8") for page in pages)
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    lines = [
+        line.partition("#")[0].strip() for kind, block in blocks if not kind for line in block.splitlines()
+    ]
+    given = {*lines, *re.findall(r"`((?:make|pip|litho-\w+) [^`]+)`", text)}
+    assert given == set(RUN_BY)
+    for command, place in RUN_BY.items():
+        file, _, test = place.partition("::")
+        if test:
+            assert test in names_in_file(file)
+        else:
+            assert command.split(" &&")[0] in (ROOT / file).read_text("utf-8")
 
 
 def test_the_page_is_short():

@@ -12,10 +12,11 @@ import pytest
 
 from litho_data.foundation.results import Record
 from litho_data.reports.page import Page
-from litho_design.reports.parts import level_table
-from litho_models.evaluation.plots import error_bars
+from litho_design.reports.tables import level_table
+from litho_models.evaluation.plots import error_bars, line_profiles
 from litho_models.evaluation.results import Benchmark
-from litho_models.evaluation.wording import benchmark_verdict, said
+from litho_models.evaluation.wording import benchmark_verdict
+from tests.litho_models.prints import make_scan
 from tests.tables import require_tables_equal_record
 
 PUBLISHED = Path(__file__).parents[1] / "docs" / "results" / "neural-lithography"
@@ -94,9 +95,19 @@ def test_the_best_model_is_that_of_the_smallest_error_in_whatever_order_they_are
         verdict = benchmark_verdict(record.model_copy(update={"scores": scores}))
         assert verdict.startswith(f"{best.model} is best")
         assert f"{second.model} is next with {second.mae_datum_free_nm:.2f} nm" in verdict
-        note = " ".join(said("notes", scores=scores))
-        assert f"left by {best.model}: {best.row_offset_sd_nm:.1f} nm along the rows" in note
-        assert f"{best.scan_line_offset_sd_nm:.1f} nm along the scan's own lines" in note
+
+
+@pytest.mark.pictures
+def test_profiles_show_layout_measurement_and_models_of_one_row():
+    scan = make_scan(0, 32)
+    residual = 0.1 * np.random.default_rng(0).normal(size=scan.shape)
+    (axes,) = line_profiles(scan, {"affine": residual}).axes
+    shown = {"layout": scan.layout_um, "measured": scan.height_um, "affine": scan.height_um - residual}
+    assert [line.get_label() for line in axes.lines] == [*shown]
+    for line, field in zip(axes.lines, shown.values(), strict=True):
+        assert line.get_linewidth() > 0
+        np.testing.assert_allclose(line.get_ydata(), field[16])
+        np.testing.assert_allclose(line.get_xdata(), (np.arange(32) + 0.5) * scan.pitch_um)
 
 
 @pytest.mark.pictures

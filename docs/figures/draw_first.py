@@ -8,7 +8,7 @@ from pathlib import Path
 from litho_data.commands.progress import run_script
 from litho_design import first, load_design, load_printer
 from litho_design.judging.gap import design_folder
-from litho_design.reports.parts import picture_grid
+from litho_design.reports.pictures import Panel, panels_figure
 from litho_design.workflows.first import DESIGNER, WITHOUT
 
 FOLDER = Path(__file__).parents[1] / "results" / "first"
@@ -27,7 +27,7 @@ def main() -> None:
             pictures.setdefault("wanted", design.target.numpy())
             title = f"designed {told} the model:\n{figures[arm]:.1f} dB"
             pictures[title] = design.display(design.image(design.printed_um(printer)))
-        figure = picture_grid({"": pictures}, design.window_um)
+        figure = panels_figure([[Panel(*shown, design.window_um) for shown in pictures.items()]])
     result.write(FOLDER)
     figure.savefig(FOLDER / "first.jpg", dpi=90, bbox_inches="tight", pil_kwargs={"quality": 85})
 

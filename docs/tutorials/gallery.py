@@ -2,7 +2,7 @@
 # # Twelve pictures, ten lines each
 #
 # The lines above each picture draw it; the page runs once from top to bottom. First come a function that
-# shows pictures and four simulated prints; for yours, see [your own scans](../own_data.md).
+# shows maps, all about 16 µm wide, and four simulated prints; for yours, see [your own scans](../own_data.md).
 
 # %%
 import litho_data
@@ -15,6 +15,7 @@ def show(pictures, colours="viridis", **limits):
         drawn = axes.imshow(picture, cmap=colours, **limits)
         figure.colorbar(drawn, ax=axes, shrink=0.7)
         axes.set_title(title, fontsize=9)
+        axes.set_axis_off()
     return figure
 
 
@@ -22,7 +23,7 @@ card = litho_data.simulate("campaign", count=4, size_px=160, seed=3)
 _ = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
-# ## 1. What to print: [layouts](../layouts.md)
+# ## 1. What to print: [layouts](../layouts.md), in levels of 0.1 µm
 
 # %%
 from litho_data.layouts import isolated_features, random_layout, siemens_star, step_ladder
@@ -91,10 +92,10 @@ figure
 from litho_data.tip import tip_certain
 
 touched = tip_certain(levelled.height_um, scan.pitch_um, 0.3)
-show({"scan, µm": levelled.height_um, "a tip of 0.3 µm touched here": touched})
+show({"scan, µm": levelled.height_um, "touched by a tip of 0.3 µm": touched})
 
 # %% [markdown]
-# ## 7. One layout through four models: [the zoo](../models.md)
+# ## 7. One layout through four models: [the zoo](../models.md), heights in µm
 
 # %%
 import torch
@@ -108,7 +109,7 @@ prints = {name: model(layout_um)[0, 0].numpy() for name, model in models.items()
 show(prints, vmin=0, vmax=1.2)
 
 # %% [markdown]
-# ## 8. What a model misses: [residuals](../evaluation.md) of models of another printer
+# ## 8. What a model misses: [residuals](../evaluation.md) of models of another printer, in nm
 
 # %%
 missed = {name: first.height_um - own for name, own in prints.items()}
@@ -141,7 +142,7 @@ settings = litho_design.hologram_settings(changes=small)
 litho_design.design_hologram("text", "zoo:physics", "hologram", settings=settings, judges=())
 design = litho_design.load_design("hologram")
 printed_um = design.printed_um(litho_design.load_printer("zoo:physics", settings.layout))
-show({"layout": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
+show({"levels": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
 
 # %% [markdown]
 # ## 11. A lens [in a program of your own](../element.md): a focus at 20 µm, from the wave behind its print
@@ -153,7 +154,7 @@ wave = torch.polar(torch.ones(160, 160), torch.pi * (x_um**2 + x_um[:, None] ** 
 element.start_from_phase(-wave.angle(), 0.6328)
 behind = element(torch.ones_like(wave), wavelength_um=0.6328).detach()
 focus = torch.fft.fftshift(torch.fft.fft2(behind * wave)).abs() ** 2
-pictures = {"levels": element.levels(), "phase": behind.angle()}
+pictures = {"levels": element.levels(), "phase, rad": behind.angle()}
 show(pictures | {"focus, logarithm": torch.log10(focus + 1e-5 * focus.max())})
 
 # %% [markdown]

@@ -1,1 +1,1 @@
-"""Dataset cards: what the raw files of a dataset are, where they lie, and which fields they make."""
+"""Dataset cards: descriptions of the raw files of a dataset, their location and their fields."""

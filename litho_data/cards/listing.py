@@ -47,7 +47,7 @@ class PrintedField:
 
 @dataclass(frozen=True)
 class LeftAside:
-    """Files that are not used: of an id with only one of its files (``unpaired``), or of a refused id."""
+    """Unused files, of an id with only one file (``unpaired``) or of a refused id."""
 
     id: str
     files: tuple[Path, ...]
@@ -57,7 +57,7 @@ class LeftAside:
 
 @dataclass(frozen=True)
 class Listing:
-    """A card, the folder of its files, the fields to build, and what was left aside, with the reason."""
+    """A card, the folder of its files, the fields to build, and unused files with reasons."""
 
     card: Card
     card_path: Path
@@ -185,7 +185,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 def _refusal(
     scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, str]], card: Card
 ) -> str:
-    """Why an id with all its files cannot be used; empty if it can."""
+    """Why an id cannot be used although it has all files; empty if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may hold letters, digits, space and ._+- only"
     if print_id is None and use == "dataset":

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import parsed
@@ -71,16 +72,21 @@ def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[L
         if isinstance(value, BaseModel):
             yield from leaves(value, f"{path}.", field.description or name)
             continue
-        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        yield Leaf(
-            path=path,
-            kind=field.annotation,
-            value=value,
-            help=field.description or "",
-            unit=str(extra.get("unit", "")),
-            options=tuple(map(str, extra.get("options", ()))),  # type: ignore[arg-type]
-            group=group,
-        )
+        yield leaf_of(field, path, value, group)
+
+
+def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> Leaf:
+    """The setting that a field states, at this path and with this value."""
+    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    return Leaf(
+        path=path,
+        kind=field.annotation,
+        value=value,
+        help=field.description or "",
+        unit=str(extra.get("unit", "")),
+        options=tuple(map(str, extra.get("options", ()))),  # type: ignore[arg-type]
+        group=group,
+    )
 
 
 def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "setting") -> dict[str, Any]:

@@ -18,9 +18,17 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """A frozen part of a result; an unknown key is an error."""
+    """A frozen part of a result; an unknown key is an error, but for those in ``FORMER``, of older files."""
 
+    FORMER: ClassVar[frozenset[str]] = frozenset()
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_today(cls, content: Any) -> Any:
+        if not isinstance(content, dict):
+            return content
+        return {name: value for name, value in content.items() if name not in cls.FORMER}
 
 
 class Result(Record):

@@ -1,4 +1,4 @@
-"""What an operation of a recipe is: a function whose signature states its parameters, defaults and limits."""
+"""Define an operation of a recipe: a function whose signature states parameters, defaults and limits."""
 
 import inspect
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the sc
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What passes from step to step: heights (µm), the current mask, pitch and layout if they are known."""
+    """The state between steps: heights (µm), the current mask, and pitch and layout if known."""
 
     height_um: Array
     mask: Array | None

@@ -1,4 +1,4 @@
-"""Tilt and datum, as in Gwyddion: planes by fit, points or prevailing facet, and where zero lies."""
+"""Remove tilt and set zero as in Gwyddion: planes by fit, points or prevailing facet."""
 
 from collections.abc import Callable
 from typing import Annotated

@@ -47,10 +47,13 @@ class Recipe(BaseModel):
         """Read a recipe.
 
         Raises:
-            InputError: no such file, no TOML, an unknown operation or key, a value out of range.
+            InputError: no such file, no TOML, no step, an unknown operation or key, a value out of range.
         """
         content = parsed(Path(path), tomllib.loads, f"cannot read recipe {path}", "a TOML file")
-        return cls.from_dict(content, source=str(path))
+        recipe = cls.from_dict(content, source=str(path))
+        if not recipe.step:
+            raise InputError(f"recipe {path}", got="no step", wanted="at least one [[step]]")
+        return recipe
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:

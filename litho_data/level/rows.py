@@ -44,7 +44,7 @@ def align_rows(
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Remove from each scan line what it does not share with the others; warns where the print moves with it.
+    """Align the rows of a scan; warns if lines were shifted because of the print.
 
     Args:
         z: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the

@@ -1,4 +1,4 @@
-"""What all levelling operations share: the choice of pixels, and the result."""
+"""Selection of pixels and result type for all levelling operations."""
 
 from typing import Literal, NamedTuple
 

@@ -1,1 +1,1 @@
-"""From a card to a dataset: operations, jobs, and the store that they make."""
+"""Build a dataset from a card: operations, jobs and the finished store."""

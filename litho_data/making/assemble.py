@@ -1,4 +1,4 @@
-"""From finished scans to a finished store: arrays, tables, manifest, attributes, hashes."""
+"""Assemble a store from finished scans: arrays, tables, manifest, attributes and hashes."""
 
 from __future__ import annotations
 

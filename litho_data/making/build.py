@@ -1,4 +1,4 @@
-"""``build_dataset``: raw files and a card in, a dataset store and a report out."""
+"""``build_dataset``: make a dataset store and a report from raw files and a card."""
 
 import functools
 import os

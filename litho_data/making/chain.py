@@ -1,4 +1,4 @@
-"""The operations on one scan in turn, and the piece of the store that they make."""
+"""Run the operations on one scan in turn, and collect the piece of the store that they make."""
 
 import json
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from litho_data.store.partial import Piece
 
 @dataclass
 class Chain:
-    """What the operations so far have made: recorded steps, arrays by name, facts by operation."""
+    """Results of the operations so far: recorded steps, arrays by name, facts by operation."""
 
     steps: list[Step] = field(default_factory=list)
     arrays: dict[str, Array] = field(default_factory=dict)
     facts: dict[str, Facts] = field(default_factory=dict)
 
     def run(self, op: str, params: Mapping[str, Any], files: Mapping[str, Path] | None = None) -> Facts:
-        """Run an operation on these files and on the arrays made before it; InputError if it cannot be."""
+        """Run an operation on these files and on earlier arrays; InputError if that is impossible."""
         step, arrays, self.facts[op] = OPERATIONS[op].run(params, files or {}, self.arrays)
         self.steps.append(step)
         self.arrays |= arrays
@@ -30,7 +30,7 @@ class Chain:
 
     @property
     def read(self) -> Facts:
-        """What the reader of the scan said about it."""
+        """Facts about the scan from its reader."""
         return next(self.facts[op] for op in READERS if op in self.facts)
 
     @property

@@ -1,4 +1,4 @@
-"""From an electron micrograph to the edges of a film: signed distances, and the height they stand for.
+"""Find the edges of a film in an electron micrograph, as signed distances, and convert them to heights.
 
 The film is bright, its rim is brightest, and charging distorts both. The edge is placed half way between the
 brightness of the ground and that of the rim in its neighbourhood. Which point on the flank of the rim is the

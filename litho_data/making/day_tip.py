@@ -1,4 +1,4 @@
-"""The tip behind all scans of a card, found before they are built."""
+"""Find the tip of all scans of a card before they are built."""
 
 import sys
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """What one scan says about the tip, in calibrated lengths if there are standards; None if unreadable."""
+    """Estimate of the tip from one scan, in calibrated lengths if there are standards; None if unreadable."""
     try:
         chain = job.begin()
     except InputError:

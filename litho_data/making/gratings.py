@@ -1,4 +1,4 @@
-"""What scans of a grating of known size say about the microscope: its scales, its unevenness, its tip."""
+"""Measure scales, unevenness and tip of a microscope on scans of a grating of known size."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The standard uncertainty of every registered height, and what it is made of."""
+"""The standard uncertainty of every registered height, and its parts."""
 
 from collections.abc import Mapping
 

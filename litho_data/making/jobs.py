@@ -1,6 +1,6 @@
-"""One unit of work of a build: a field's files in, a finished piece or a reason for skipping out.
+"""One unit of work of a build, from a field's files to a finished piece or a reason for skipping it.
 
-Jobs travel to other processes and machines, so they hold paths and plain parameters only.
+Jobs are sent to other processes and machines, so they contain only paths and plain parameters.
 """
 
 from collections.abc import Mapping
@@ -23,12 +23,12 @@ from litho_data.store.partial import PartialStore, Piece
 _LAYOUT_AWARE = "layout-aware"
 # Rim of level 0 around a field that is alone on the substrate, as models extend the edge of a layout.
 _BARE_PX = 2
-# Film or ground that a micrograph shows this deep, px, inside the opposite of its layout is dirt or a pit.
+# Film this deep (px) in a gap of the layout is dirt, and ground this deep in its film is a pit.
 _DIRT_PX = 5
 
 
 class Job(Protocol):
-    """What a build needs of a unit of work."""
+    """The interface of a unit of work."""
 
     @property
     def id(self) -> str:
@@ -101,7 +101,7 @@ class FieldJob:
         return chain.arrays.get("mask_level")
 
     def begin(self) -> Chain:
-        """Layout and scan as they were read, and the scales; InputError if one of them cannot be had."""
+        """Read layout, scan and scales; InputError if one of them is unusable."""
         chain = Chain()
         self._read_layout(chain)
         file = {self.scan_name: self.field.scan}
@@ -122,7 +122,7 @@ class FieldJob:
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 
     def run(self) -> Piece:
-        """The finished scan; InputError if its files do not allow it."""
+        """Make the finished scan; InputError if its files do not allow it."""
         chain = self.begin()
         (self._cover if self._is_micrograph else self._level)(chain)
         arrays, facts = chain.arrays, chain.facts
@@ -151,7 +151,7 @@ class FieldJob:
         )
 
     def _cover(self, chain: Chain) -> None:
-        """The rest of the chain for a micrograph: edges, registration, coverage on the layout's grid."""
+        """Run the rest of the chain for a micrograph: edges, registration, coverage on the layout's grid."""
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
         edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film})
@@ -160,7 +160,9 @@ class FieldJob:
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
     def _level(self, chain: Chain) -> None:
-        """The rest of the chain for heights: levelling, and for the dataset registration and resampling."""
+        """Run the rest of the chain for heights: levelling, and for the dataset also registration and
+        resampling.
+        """
         of_dataset = self.field.use == "dataset"
         pitch = {"scan_pitch_um": chain.pitch_um}
         recipe = dict(self.recipe)
@@ -181,9 +183,9 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """The layout's grid, and how many of its outermost pixels are no evidence.
+        """The layout's grid, and the number of its outermost pixels to ignore.
 
-        The layout does not show what lies around the field.
+        The height of these pixels depends on the unknown surroundings of the field.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)

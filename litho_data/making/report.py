@@ -1,4 +1,4 @@
-"""The report of a build: what went in, what came out, and pictures of every scan."""
+"""The report of a build: inputs, results, and pictures of every scan."""
 
 from __future__ import annotations
 

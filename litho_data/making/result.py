@@ -1,4 +1,4 @@
-"""``build.json``: what a build made and what it left out."""
+"""``build.json``: the record of a build."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,16 +9,16 @@ from litho_data.store.schema import DatasetId
 
 
 class LeftOut(Record):
-    """An id that is not in the store, and why."""
+    """An id that is not in the store, with the reason."""
 
     id: str
     reason: str
 
 
 class BuildResult(Result):
-    """What a build made and what it left out; ``reused`` scans were finished by an earlier build.
+    """Scans that a build made or left out; ``reused`` scans were finished by an earlier build.
 
-    ``findings``: what should be done, worst first.
+    ``findings``: things to fix, worst first.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"

@@ -1,4 +1,4 @@
-"""Is a scan the print of its own layout? A whole set shows which ids, files and doses were mixed up.
+"""Find scans that do not show their own layout, because ids, files or doses were mixed up.
 
 A scan that registers may still show a similar layout, a mirrored one, or its own layout at another dose. A
 scan that does not register may show another layout of the set.
@@ -66,7 +66,7 @@ def prints_of(
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Signs that a scan does not show its own layout, by id; empty for most sets."""
+    """Signs that scans do not show their own layout, by id; empty for most sets."""
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -120,7 +120,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Scans that another layout of the set explains better, at the warp found for their own layout."""
+    """Scans that another layout of the set explains better, under the warp onto their own layout."""
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
         # A layout that was printed more than once is named by its first id.

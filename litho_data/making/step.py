@@ -1,4 +1,4 @@
-"""One step of a build: an operation, run and recorded, so that its arrays can be traced and made again."""
+"""One step of a build: an operation that is run and recorded, so its arrays can be traced and reproduced."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Function = Callable[[Params, Files, Inputs], Made]
 
 @dataclass(frozen=True)
 class Step:
-    """One operation on one scan: what went in, with which parameters, and what came out.
+    """One operation on one scan, with inputs, parameters and outputs.
 
     ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), ``outputs``
     are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source that
@@ -85,7 +85,7 @@ class Operation:
     def run(
         self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]
     ) -> tuple[Step, Arrays, Facts]:
-        """Run the operation: its record, and what it made.
+        """Run the operation; returns its record and its arrays.
 
         Args:
             params: explicit parameters, plain data.

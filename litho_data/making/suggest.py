@@ -1,4 +1,4 @@
-"""Which recipe levels the scans of a card best, compared on three of them by what the layout explains."""
+"""Find the best levelling recipe for a card, by the heights that the layout explains in three scans."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def suggest_recipe(
 
 
 def _best(left_nm: Mapping[str, float]) -> str:
-    """The recipe that leaves least, or a simpler one, listed before it, that leaves hardly more."""
+    """The recipe with the smallest residual, or a simpler one (listed earlier) with nearly the same."""
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
@@ -155,7 +155,7 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Root mean square of what a free response to the layout leaves in blocks outside its fit, µm.
+    """Rms residual of a free response to the layout, in blocks outside its fit, µm.
 
     Args:
         height_um: (ny, nx), NaN where not measured.

@@ -1,4 +1,4 @@
-"""Is a dataset good, and if not, what should be done? Compares every number of the card with the heights."""
+"""Judge a dataset by comparing every number of the card with the heights, and list what to fix."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -38,7 +38,7 @@ class Weight(IntEnum):
 
 
 class Finding(Record):
-    """One thing to do: the scan that it concerns, or all scans, and what is wrong."""
+    """One thing to fix, with the scan that it concerns, or all scans."""
 
     scan: str
     text: str
@@ -86,7 +86,7 @@ def findings(
     skipped: Mapping[str, str],
     card: Card,
 ) -> list[Finding]:
-    """What should be done, worst first; empty for a good dataset.
+    """Things to fix, worst first; empty for a good dataset.
 
     Args:
         records: records of the dataset's scans.
@@ -181,7 +181,7 @@ def _shown(times: float) -> str:
 
 
 def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
-    """The first words of the report: good, or what should be done, worst first."""
+    """The first words of the report: good, or a list of things to fix, worst first."""
     if not found:
         return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
     shown = " · ".join(str(one) for one in found[:_SHOWN])

@@ -1,4 +1,4 @@
-"""Arrays that describe themselves: HDF5 of any program, NetCDF 3 and 4, MATLAB; scale, unit, axes applied."""
+"""Read self-describing arrays (HDF5 of any program, NetCDF 3 and 4, MATLAB) with scale, unit and axes."""
 
 from __future__ import annotations
 
@@ -83,10 +83,10 @@ def array_channel(
     coordinates: Mapping[str, Coordinate] | None = None,
     around: Mapping[str, Any] | None = None,
 ) -> Channel:
-    """The channel of a two-dimensional array: [y, x] unless the names of its dimensions say otherwise.
+    """Make the channel of a two-dimensional array, which is [y, x] unless the names of its dimensions differ.
 
-    ``raw`` reads its values; ``around`` holds the attributes beside and above it. x grows to the right; the
-    rows keep the order of the file, even if their coordinate falls.
+    ``raw`` reads its values; ``around`` contains the attributes beside and above it. x grows to the right.
+    Rows keep the order of the file, even if their coordinate falls.
 
     Raises:
         InputError: attributes that change the values in an unknown way, which the message names; values that

@@ -36,7 +36,7 @@ _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 def confined(
     read_channels: Callable[[Path], list[Channel]], imports: tuple[str, ...]
 ) -> Callable[[Path], list[Channel]]:
-    """The same function, run in the child process, as is the loading of its channels.
+    """Wrap a function so that it runs in the child process, together with the loading of its channels.
 
     Without POSIX the function runs in this process.
 
@@ -84,7 +84,7 @@ class _Child:
                     f"cannot read {path}", got=self._end(error, computing_s), hint="the file may be damaged"
                 ) from error
             except BaseException:
-                self.stop()  # a late answer must not be taken for that of the next file
+                self.stop()  # A late answer must not count as the answer for the next file.
                 raise
         if refusal:
             raise InputError(refusal)

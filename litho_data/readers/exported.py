@@ -1,4 +1,4 @@
-"""Files that the design package wrote for a printer, read back as levels by the sidecar beside each."""
+"""Read files that the design package wrote for a printer back as levels, with the help of their sidecars."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.files import read_text
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.gds_rows import GdsRows
@@ -20,14 +21,14 @@ _STL_HEADER_BYTES = 80
 
 
 def export_of(file: Path) -> dict[str, Any]:
-    """What the design package wrote about an exported file; empty for other files.
+    """The sidecar that the design package wrote for an exported file; empty for other files.
 
     Raises:
         InputError: the sidecar belongs to another file.
     """
     path = file.with_name(f"{file.name}.json")
     try:
-        says = json.loads(path.read_text(encoding="utf-8"))
+        says = json.loads(read_text(path))
     except (OSError, ValueError):
         return {}
     if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):

@@ -1,4 +1,4 @@
-"""Missing pixels that a file marks by a number or a word: the caller names the mark or is asked for it."""
+"""Handle missing pixels that a file marks by a number or a word; the caller must name the mark."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,8 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# A number that no known program uses must lie this many spans off the other values; a lone pixel, further.
+# Distance from the other values, in spans, from which an unknown number counts as a mark; larger for a lone
+# pixel.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
 # Relative tolerance: values are held as float32, and very large ones are written with few digits.

@@ -10,6 +10,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import um_per
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked
@@ -62,7 +63,8 @@ def read_scan(
 
     Raises:
         InputError: an unreadable file, no or several height channels, a missing or contradicting unit or
-            size, a value that looks like an unnamed mark of missing pixels, or no finite value.
+            size, a value that looks like an unnamed mark of missing pixels, heights that cannot be, or no
+            finite value.
     """
     with unpacked(require_file(path)) as file:
         reader = _settle_format(file, format)
@@ -80,8 +82,12 @@ def read_scan(
             notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
         size_um = None
     stated_unit, factor = _settle_unit(file, chosen, values, unit, full_scale_um)
+    height = _to_um(values, factor)
+    finite = height[np.isfinite(height)]
+    ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
+    HEIGHT_UM.require(f"{file}: heights in µm, by unit {stated_unit!r}", ends_um)
     return Scan(
-        height_um=_to_um(values, factor),
+        height_um=height,
         pitch_um=_settle_pitch(file, chosen, size_um, stated_unit),
         name=file.stem,
         channel=chosen.name,

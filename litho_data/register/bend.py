@@ -1,4 +1,4 @@
-"""A bent scan: the smooth, quadratic difference between the true and the stated position of the scanner."""
+"""The bend of a scan: the smooth difference between the true and the stated position of the scanner."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ SEARCH_BLUR_PX = 2.0
 
 @dataclass(frozen=True)
 class CoarseFit:
-    """Where the scan lies, to a few pixels.
+    """Position of the scan, to a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
     ``points`` is None if too few keypoints match; the fit is then the best correlation over all shifts.

@@ -1,4 +1,4 @@
-"""Scans that no straight warp fits: a scanner bends them, or it creeps.
+"""Register scans that no straight warp fits, because the scanner bends them or creeps.
 
 A bend displaces the image by a quadratic function of position. A scanner that is still settling displaces its
 lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the linear part of

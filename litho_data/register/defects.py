@@ -1,7 +1,7 @@
-"""Where a scan shows something other than the print: dust, collapsed or missing parts, lifted film.
+"""Find areas where a scan does not show the print: dust, collapsed or missing parts, lifted film.
 
-Such an area pulls a least-squares warp by pixels. Its heights differ from what the layout predicts by many
-times the usual misfit over a connected area, whatever the response of the printer is.
+Such an area shifts a least-squares warp by pixels. Over a connected area its heights differ from the
+prediction of the layout by many times the usual misfit, for any response of the printer.
 """
 
 from dataclasses import replace
@@ -123,7 +123,7 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing.
+    """Scan minus the part that the layout explains, (ny, nx), NaN at the border and where not measured.
 
     None if the scan shows next to nothing of the layout.
     """

@@ -1,4 +1,4 @@
-"""How well a registration is known: held-out blocks, bootstrap, correlation."""
+"""The uncertainty of a registration: held-out blocks, bootstrap, correlation."""
 
 from dataclasses import dataclass
 
@@ -19,10 +19,10 @@ SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """How single blocks of the field fit the warp; arrays (n, 2) of (x, y) in layout pixels.
+    """Fit of single blocks of the field to the warp; arrays (n, 2) of (x, y) in layout pixels.
 
-    ``shift_px`` is the distance of a block's content from where the warp puts it, ``held_out_px`` the same
-    for a warp fitted without the block.
+    ``shift_px`` is the displacement of a block's content from its position by the warp, ``held_out_px`` the
+    same for a warp fitted without the block.
     """
 
     middle_px: Array

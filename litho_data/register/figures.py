@@ -14,7 +14,7 @@ from litho_data.register.topography import quadratic_basis
 
 
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    """How the warp was found, and how well it explains the matches and the heights."""
+    """Figures of the fit: how the warp was found, and how well it explains matches and heights."""
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     figures: dict[str, Any] = {
         "model": fine.refinement.model if bend is None else bend.kind,
@@ -57,7 +57,9 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
-    """How well the warp is known: held-out blocks, bootstrap, other candidates; and the blocks."""
+    """Figures of the warp's uncertainty, from held-out blocks, bootstrap and other candidates; also the
+    blocks.
+    """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
     aligned = fine.refinement.warped - background

@@ -1,4 +1,4 @@
-"""How a warp can change: the generators of every rung of the ladder, and the quadratic flows."""
+"""The generators of warps on every rung of the ladder, and the quadratic flows."""
 
 from collections.abc import Iterator
 from typing import Literal

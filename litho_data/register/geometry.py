@@ -1,4 +1,4 @@
-"""Frames, units and orientations: how pixel indices, micrometres and rotated images relate.
+"""Frames, units and orientations: relations of pixel indices, micrometres and rotated images.
 
 Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. An *index* frame counts
 pixel centres 0, 1, 2 …; the micrometre frame of the same image has those centres at

@@ -1,4 +1,4 @@
-"""The record of one registration, and when it counts as passed."""
+"""The record of one registration, and the limits of a pass."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -109,7 +109,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
         f"{defects:.1%} of the field shows something other than the print and is left out": defects > 0,
         f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
-        "layout looks alike in another orientation; upright assumed": tied and upright,
+        "layout looks the same in another orientation; upright assumed": tied and upright,
         f"target registration error {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,
         "inverted contrast": figures["polarity"] == -1,
         "coarse fit by correlation, no feature matches": figures["method"] != "orb",
@@ -120,7 +120,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
-    """The record of a scan for which nothing could be fitted: every figure is missing."""
+    """The record of a scan without any fit, in which every figure is missing."""
     empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
     figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
     return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

@@ -28,7 +28,7 @@ TOLERANCE_PX = 1e-3
 
 @dataclass(frozen=True)
 class Refinement:
-    """A converged warp, and the data that tell how well it is known.
+    """A converged warp, and the data for its uncertainty.
 
     ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it maps to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, gaps filled. ``gram`` (cells_y, cells_x,

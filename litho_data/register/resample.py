@@ -76,7 +76,7 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """The same along one axis, for the offsets of lines that follow one another along it."""
+    """The same along one axis, for the offsets of consecutive lines along it."""
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 

@@ -1,4 +1,4 @@
-"""The dataset store: its schema, and reading it."""
+"""The dataset store: schema, reading and writing."""
 
 from litho_data.store.read import PrintedScan, Store, open_store
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -35,7 +34,7 @@ def open_root(path: str | Path) -> zarr.Group:
     try:
         source = ZipStore(location, mode="r") if location.is_file() else location
         return zarr.open_group(source, mode="r", zarr_format=3, use_consolidated=False)
-    except (OSError, ValueError, BadZipFile) as error:
+    except Exception as error:  # zarr lets the errors of its metadata parsers through
         raise InputError(
             f"cannot open {location} as a dataset store",
             got="no Zarr v3 group",
@@ -54,7 +53,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
     return _of_kind(parent, name, zarr.Group, "group")
 
 
-def array_of(parent: zarr.Group, name: str) -> zarr.Array:
+def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
     """The child array of that name.
 
     Raises:
@@ -83,7 +82,7 @@ def values_of(parent: zarr.Group, name: str) -> Array:
     return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
 
 
-def decoded(array: zarr.Array, selection: Any, what: str) -> Array:
+def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
     """A selection of an array.
 
     Raises:

@@ -154,7 +154,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
     return checked
 
 
-def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
+def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
     """The arrays over all scans by name; InputError if one is missing or has another shape, type or order."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}

@@ -1,4 +1,4 @@
-"""A store under construction: finished scans are kept, so that an interrupted build resumes.
+"""A store under construction, which keeps finished scans so that an interrupted build resumes.
 
 It lies beside the store as ``.<name>.partial`` and becomes the store in one rename. A scan is finished when
 its record exists, which is written last. It is reused only if its files, parameters and code are the same and
@@ -118,7 +118,7 @@ class PartialStore:
             return dict(archive)
 
     def publish(self) -> None:
-        """Put the finished store in its place; an older store there is replaced."""
+        """Move the finished store to its path, where it replaces an older one."""
         publish(self.store, self.out)
         self.discard()
 

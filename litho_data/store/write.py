@@ -114,7 +114,7 @@ def pixel_centres_um(count: int, pitch_um: float) -> Array:
 
 
 def write_table(
-    root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict | None = None
+    root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict[str, Any] | None = None
 ) -> None:
     """A table as a group of one-dimensional arrays over ``dim``; text as UTF-8, no missing text."""
     group = root.create_group(name, attributes=attributes or {})
@@ -144,7 +144,7 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
     array[...] = values
 
 
-def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array:
+def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
     """A new array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unseen.
 
     By default a chunk of fill values only has no file, and would look like a lost one.
@@ -165,7 +165,7 @@ def consolidate(root: zarr.Group) -> None:
         zarr.consolidate_metadata(root.store)
 
 
-def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.Array:
+def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.Array[Any]:
     variable = VARIABLES[name]
     unit = {"comment": MIXED_UNITS[name]} if name in MIXED_UNITS else {"units": variable.unit}
     attributes = {**unit, "long_name": variable.long_name}

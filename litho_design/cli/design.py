@@ -19,16 +19,12 @@ from litho_design.cli.options import (
     Extrapolate,
     Given,
     Out,
-    Scan,
-    ScanAligned,
-    ScanLevelling,
-    ScanSizeUm,
-    ScanUnit,
     as_toml,
-    measured_source,
+    takes_parts,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.images.measurements import MeasuredSource
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
@@ -122,7 +118,7 @@ def hoe(
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
     settings = _settings(given, _hologram, "hoe", spread_of)
-    from litho_design.large.bands import Ranks
+    from litho_design.optimisation.ranks import Ranks
     from litho_design.workflows.design import design_hologram
 
     design = design_hologram(
@@ -134,6 +130,7 @@ def hoe(
 
 
 @takes_settings(ReliefSettings())
+@takes_parts(scan=MeasuredSource)
 def correct(
     relief: Annotated[
         str,
@@ -142,15 +139,11 @@ def correct(
     model: Model,
     out: Out,
     given: Given,
+    scan: MeasuredSource | None,
     after: Annotated[
         Path | None,
         typer.Option(help="a first correction, printed and measured: the error of its print is subtracted"),
     ] = None,
-    scan: Scan = None,
-    scan_unit: ScanUnit = None,
-    scan_size_um: ScanSizeUm = None,
-    scan_levelling: ScanLevelling = "bow",
-    scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
     judge: Judges = None,
     robust: Robust = True,
@@ -165,9 +158,8 @@ def correct(
     settings = _settings(given, relief_settings, "correct", spread_of)
     from litho_design.workflows.design import correct as correct_relief
 
-    print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
-        relief, model, out, settings=settings, after=after, scan=print_of,
+        relief, model, out, settings=settings, after=after, scan=scan,
         judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
@@ -230,7 +222,7 @@ def compare(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design with every arm, print with every judge: the design-to-manufacturing gap.
+    """Design with every arm and print with every judge, to measure the design-to-manufacturing gap.
 
     Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
     """

@@ -1,4 +1,4 @@
-"""Options made from the fields of the settings, so that every setting is stated in one place."""
+"""Make options from the fields of the settings, so every setting is stated in one place."""
 
 from __future__ import annotations
 
@@ -8,19 +8,15 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from litho_data.commands.app import keyword, takes_more, with_further_options
-from litho_data.commands.settings import Leaf, assigned, flattened, leaves, read_settings
+from litho_data.commands.app import keyword, takes, takes_more, with_further_options
+from litho_data.commands.settings import Leaf, assigned, flattened, leaf_of, leaves, read_settings, refused
 from litho_data.foundation.errors import InputError
-
-if TYPE_CHECKING:
-    from litho_design.judging.measured import MeasuredSource
-
-N = TypeVar("N", int, float)
 
 Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
@@ -40,52 +36,6 @@ BandPx = Annotated[
         hidden=True,
     ),
 ]
-Scan = Annotated[Path | None, typer.Option(help="AFM height map of the printed part")]
-ScanUnit = Annotated[
-    str | None, typer.Option(help="unit of the scan's heights, if the file has none", hidden=True)
-]
-ScanSizeUm = Annotated[
-    float | None, typer.Option(help="side of the scan, µm, if the file has none", hidden=True)
-]
-ScanLevelling = Annotated[
-    Literal["none", "plane", "bow"],
-    typer.Option(
-        help="what is removed from the scan: nothing, a plane, or a bow of second order", hidden=True
-    ),
-]
-ScanAligned = Annotated[
-    bool,
-    typer.Option(
-        "--scan-aligned",
-        hidden=True,
-        help="the scan lies upright on the pixels of the element; for one that looks alike in several places",
-    ),
-]
-
-
-def measured_source(
-    scan: Path | None,
-    unit: str | None,
-    size_um: float | None,
-    levelling: Literal["none", "plane", "bow"],
-    **further: Any,
-) -> MeasuredSource | None:
-    """The measured print that the options of a scan describe, with further fields; None without a scan."""
-    if scan is None:
-        return None
-    from litho_design.judging.measured import MeasuredSource
-
-    return MeasuredSource(scan, unit, None if size_um is None else (size_um, size_um), levelling, **further)
-
-
-def numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
-    """The comma-separated numbers of an option."""
-    try:
-        return [kind(word) for word in words.split(",")]
-    except ValueError:
-        raise InputError(option, got=repr(words), wanted="numbers, separated by commas") from None
-
-
 _Config = Annotated[
     Path | None,
     typer.Option(
@@ -138,6 +88,10 @@ class Given:
 _FIRST = {
     *("variant", "task", "layout.size_px", "layout.cell_um", "optics.wavelength_um", "optics.distance_um"),
     *("search.iterations", "search.seed", "height_um"),
+    *("pedestal_um", "slicing_um", "hatching_um", "gds_layers"),
+    *("gwl.mode", "gwl.field_um", "gwl.speed_um_s", "gwl.power_percent"),
+    *("scan.path", "camera.path", "camera.pitch_um", "camera.dark_level", "camera.flat", "camera.imaged"),
+    *("camera.orientation", "camera.power_counts"),
 }
 
 
@@ -157,7 +111,7 @@ def takes_settings(
         if leaf.options and leaf.path not in leave_out:
             found.setdefault(leaf.path, []).append(leaf)
     paths = {path.replace(".", "_"): path for path in found}
-    extra = [_parameter(name, found[path], len(presets)) for name, path in paths.items()]
+    extra = [_parameter(name, found[path]) for name, path in paths.items()]
     extra += [keyword("config", _Config), keyword("set_", _Set)]
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -165,7 +119,9 @@ def takes_settings(
         def run(**values: Any) -> None:
             config, words = values.pop("config"), assigned(values.pop("set_") or [])
             said = {path: values.pop(name) for name, path in paths.items()}
-            options = {path: value for path, value in said.items() if value is not None}
+            options = {
+                path: _listed(found[path][0], value) for path, value in said.items() if value is not None
+            }
             twice = sorted(set(options) & set(words))
             if twice:
                 raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="one of them")
@@ -180,6 +136,51 @@ def takes_settings(
     return decorate
 
 
+def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of the fields of some records, and pass it one of each by name.
+
+    The command gets None for a record if none of its options is given.
+    """
+    found = {
+        part: {name: leaf_of(field, f"{part}.{name}") for name, field in kind.__pydantic_fields__.items()}
+        for part, kind in parts.items()
+    }
+    extra = [
+        _parameter(f"{part}_{name}", [leaf]) for part, own in found.items() for name, leaf in own.items()
+    ]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            for part, own in found.items():
+                said = {name: values.pop(f"{part}_{name}") for name in own}
+                values[part] = _made(
+                    parts[part], own, {name: value for name, value in said.items() if value is not None}
+                )
+            command(**values)
+
+        names = inspect.signature(command).parameters.keys() - parts.keys()
+        kept = [
+            one for one in inspect.signature(command, eval_str=True).parameters.values() if one.name in names
+        ]
+        return takes(run, [*(one.replace(kind=one.KEYWORD_ONLY) for one in kept), *extra])
+
+    return decorate
+
+
+def _made(kind: type[Any], leaves: Mapping[str, Leaf], values: Mapping[str, Any]) -> Any:
+    if not values:
+        return None
+    for name, field in kind.__pydantic_fields__.items():
+        if field.is_required() and name not in values:
+            given = leaves[next(iter(values))].options[0]
+            raise InputError(given, got=f"no {leaves[name].options[0]}", wanted=_described(leaves[name]))
+    try:
+        return kind(**values)
+    except ValidationError as error:
+        raise refused(error) from None
+
+
 def as_toml(settings: BaseModel) -> str:
     """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
     lines: list[str] = []
@@ -190,7 +191,7 @@ def as_toml(settings: BaseModel) -> str:
     for table, inside in tables.items():
         lines += ["", f"[{table}]"] if table else []
         for leaf in inside:
-            notes = [_described(leaf)]
+            notes = [_told(leaf)]
             if get_origin(leaf.kind) is Literal:
                 notes.append(", ".join(map(str, get_args(leaf.kind))))
             notes += [" or ".join(leaf.options)] if leaf.options else []
@@ -200,25 +201,41 @@ def as_toml(settings: BaseModel) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Parameter:
-    """One option for a setting that one or several presets have."""
-    leaf = same[0]
-    described = _described(leaf)
-    values = list(dict.fromkeys(_shown(one.value) for one in same))
+def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
+    """Make one option for a setting of one or several presets."""
+    leaf, kind = same[0], same[0].kind
+    if get_origin(kind) is UnionType:
+        kind = get_args(kind)[0]
+    values = list(dict.fromkeys(_shown(one.value) for one in same if one.value is not None))
     option = typer.Option(
         *leaf.options,
-        # Options begin in lower case; in a file of settings the text starts a line.
-        help=described[:1].lower() + described[1:],
-        show_default=" or ".join(values),
+        help=_described(leaf),
+        show_default=" or ".join(values) or False,
         rich_help_panel=leaf.group or None,
         hidden=leaf.path not in _FIRST,
     )
-    return keyword(name, Annotated[leaf.kind | None, option])
+    return keyword(name, Annotated[(str if get_origin(kind) is tuple else kind) | None, option])
+
+
+def _listed(leaf: Leaf, value: Any) -> Any:
+    """Format the values of an option; several numbers are separated by commas."""
+    if get_origin(leaf.kind) is not tuple:
+        return value
+    try:
+        return [float(word) for word in value.split(",")]
+    except ValueError:
+        raise InputError(leaf.options[0], got=repr(value), wanted="numbers, separated by commas") from None
 
 
 def _described(leaf: Leaf) -> str:
+    """Description of a setting: in lower case for an option, capitalised in a file of settings."""
+    return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
+
+
+def _told(leaf: Leaf) -> str:
     return f"{leaf.help}, {leaf.unit}" if leaf.unit else leaf.help
 
 
 def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    shown = value if isinstance(value, tuple) else (value,)
+    return ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in shown)

@@ -1,4 +1,4 @@
-"""`litho-design sheet new` and `read`: one sheet for a lab to print and scan, and what comes back."""
+"""`litho-design sheet new` and `read`: make one sheet of prints for a lab, and read its scans."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
-from litho_design.exports.formats import Format
+from litho_design.exports.job import Format
 
 sheet = typer.Typer(help="One sheet of prints: make it for a lab, and read its scans.", no_args_is_help=True)
 
@@ -30,7 +30,7 @@ def new(
     seed: Annotated[int, typer.Option(min=0, help="seed of the random layouts")] = 0,
     device: Device = "cpu",
 ) -> None:
-    """Write what a lab needs to print and scan one sheet; an interrupted run in OUT is continued.
+    """Write the files for a lab to print and scan one sheet; an interrupted run in OUT is continued.
 
     Example: litho-design sheet new --format gwl --out sheet
     """
@@ -48,7 +48,7 @@ def read(
     out: Out,
     device: Device = "cpu",
 ) -> None:
-    """Turn the scans into a model of the printer, what it lacks, and a comparison of both holograms.
+    """Learn a model of the printer from the scans, find what it lacks, and compare both holograms.
 
     Example: litho-design sheet read sheet --out answer
     """

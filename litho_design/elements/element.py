@@ -28,12 +28,13 @@ Index = Callable[[float], float]
 
 
 class Element(nn.Module):
-    """A printed element in a program of your own: ``element(field, wavelength_um)`` is the wave behind it.
+    """A printed element for your own program: ``element(field, wavelength_um)`` is the wave behind it.
 
     Its only trainable parameters are the free levels, one per cell or ring. They are rounded and kept within
     the layout's levels with a straight-through gradient. A frozen model prints them with its guard ring, and
-    the printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. So the wave
-    always belongs to a printable layout; ``whole = False`` leaves the levels real, for the first steps.
+    the printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The wave
+    therefore always belongs to a printable layout. ``whole = False`` leaves the levels real, for the first
+    steps.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
@@ -107,9 +108,10 @@ class Element(nn.Module):
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
-        tile = self.tile_px
-        large = tile is not None and self.layout.size_px > tile
-        return self.printer.print_in_tiles(level, tile) if large and tile else self.printer(level)
+        if self.tile_px is None or self.layout.size_px <= self.tile_px:
+            return self.printer(level)
+        around = torch.nn.functional.pad(level, (self.printer.halo_px,) * 4)
+        return self.printer.print_in_tiles(around, self.tile_px)
 
     def levels(self) -> np.ndarray:
         """The layout to be printed, uint8 (size, size)."""

@@ -1,4 +1,4 @@
-"""A print inside ``torch.func`` and ``torch.compile``, which cannot trace the models' own gradients."""
+"""Make prints work in ``torch.func`` and ``torch.compile``, which cannot trace the models' own gradients."""
 
 from __future__ import annotations
 

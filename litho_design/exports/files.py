@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.commands.settings import changed
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, file_sha256
@@ -16,18 +17,26 @@ from litho_data.foundation.quantities import LEVEL_HEIGHT_UM, PITCH_UM
 from litho_data.readers.exported import exported_levels, exported_rows
 from litho_design.elements.element import Element
 from litho_design.exports.dxf import write_dxf
-from litho_design.exports.formats import Format
-from litho_design.exports.gds import GdsLayers, write_gds
-from litho_design.exports.gwl import Gwl, write_gwl
+from litho_design.exports.gds import write_gds
+from litho_design.exports.gwl import write_gwl
 from litho_design.exports.image import (
     linear_greys,
     measured_greys,
     write_image,
     write_tiff,
 )
+from litho_design.exports.job import Format, PrintJob
 from litho_design.exports.marks import Marks, with_marks
 from litho_design.exports.rows import LevelRows, bands_of, layout_rows
-from litho_design.exports.sidecar import Sidecar, of_design, of_layout, read_sidecar, sidecar_path
+from litho_design.exports.sidecar import (
+    Sidecar,
+    cell_of,
+    of_design,
+    of_job,
+    of_layout,
+    read_sidecar,
+    sidecar_path,
+)
 from litho_design.exports.stl import write_stl
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.layout import LayoutSettings
@@ -62,13 +71,9 @@ def export(
     *,
     pitch_um: float = 0.1,
     level_height_um: float = 0.1,
-    pedestal_um: float = 1.0,
-    slicing_um: float = 0.1,
-    hatching_um: float = 0.1,
-    gds_layers: GdsLayers = "cumulative",
-    gwl: Gwl | None = None,
     dose_curve: str | Path | None = None,
     marks: bool = False,
+    **job: Any,
 ) -> Path:
     """Write a layout for the printer, and ``<file>.json`` beside it.
 
@@ -82,78 +87,63 @@ def export(
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; exports of the same layout in other formats stay in it.
         pitch_um, level_height_um: pixel and level of an array; designs and elements have their own.
-        pedestal_um: base under level 0; printed by STL and GWL, a note to the operator in other formats.
-        slicing_um, hatching_um: settings of the print job; the sidecar records them, GWL uses them.
-        gwl: mode, write field, speed and power of GWL; ``Gwl()`` by default.
         dose_curve: CSV of ``grey,height_um``, the printed height of each grey value, for the grey formats
             bmp, png16 and dxf; without it, grey is linear in height.
         marks: add a mark of orientation and a flat witness beside the element (see ``with_marks``).
+        job: changes of ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
 
     Returns:
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, a format that cannot hold it or would need too much memory, job
-            settings below zero, an element too small for marks, or a folder that holds something else.
+        InputError: an incomplete design, a format that cannot hold it or would need too much memory, a job
+            that no printer has, an element too small for marks, or a folder that holds something else.
     """
     require_known("format", format, _SUFFIX)
-    job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
-    for setting, value in job.items():
-        # Only a closed solid needs a base.
-        may_be_zero = setting == "pedestal_um" and format not in ("stl", "gwl")
-        if not 0 <= value <= LEVEL_HEIGHT_UM.high or (value == 0 and not may_be_zero):
-            wanted = f"a positive length of {LEVEL_HEIGHT_UM.high:g} µm at most"
-            raise InputError(setting, got=f"{value:g} µm", wanted=wanted)
+    made = changed(PrintJob(), job)
     PITCH_UM.require("pitch_um", pitch_um)
     LEVEL_HEIGHT_UM.require("level_height_um", level_height_um)
     source = _source(design, pitch_um, level_height_um)
-    levels = written = source.levels
+    layout, levels = source.layout, source.levels
     if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:
         got = f"{format} of {levels.shape[0]} x {levels.shape[1]} px"
         raise InputError("format of a large element", got=got, wanted="tiff or gds, written in pieces")
     found: Marks | None = None
     if marks:
         if source.design is None:
-            raise InputError(
-                "marks",
-                got="levels without a design",
-                wanted="a design, whose model gives the printer's reach",
-            )
+            wanted = "a design, whose model gives the printer's reach"
+            raise InputError("marks", got="levels without a design", wanted=wanted)
         guard_um, heights = source.design.printer.guard_um, source.design.stroke.printed_height_um
-        written, found = with_marks(levels, source.layout, guard_um, heights)
-    greys, white_um = None, None
-    if format in _GREY_BITS:
-        bits = _GREY_BITS[format]
-        greys = (linear_greys if dose_curve is None else measured_greys(dose_curve))(source.layout, bits)
-        if dose_curve is None:
-            white_um = (2**bits - 1) / greys[1] * source.layout.level_height_um
-    name = f"layout{_SUFFIX[format]}"
-    place = Path(out)
+        levels, found = with_marks(levels, layout, guard_um, heights)
+    greys, white_um, bits = None, None, _GREY_BITS.get(format)
+    if bits is not None and dose_curve is not None:
+        greys = measured_greys(layout, bits, dose_curve)
+    elif bits is not None:
+        greys = linear_greys(layout, bits)
+        white_um = (2**bits - 1) / greys[1] * layout.level_height_um
+    name, place = f"layout{_SUFFIX[format]}", Path(out)
     _require_same_layout(place, name, source.sha256)
     with (
         growing_folder(place, f"{name}.json", holds="layout*"),
         TemporaryDirectory(prefix=".layout.", suffix=".partial", dir=place) as temporary,
     ):
         file = Path(temporary) / name
-        sidecar: dict[str, Any] = {
-            "file": name,
-            "format": format,
-            "layout_sha256": source.sha256,
-            **of_layout(source.layout, (written.shape[0], written.shape[1])),
-            **job,
-            "greys": greys,
-            "white_height_um": white_um,
-            "gds_layers": gds_layers if format == "gds" else None,
-            "gwl": (gwl or Gwl()) if format == "gwl" else None,
-            "marks": found,
-        }
-        if source.design is not None and source.folder is not None:
-            sidecar |= of_design(source.folder, source.design)
-        _write(file, Sidecar(file_sha256="", **sidecar), written)
-        record = Sidecar(file_sha256=file_sha256(file), **sidecar)
+        _write(file, format, levels, layout, made, greys, found)
+        record = Sidecar(
+            file=name,
+            file_sha256=file_sha256(file),
+            format=format,
+            layout_sha256=source.sha256,
+            greys=greys,
+            white_height_um=white_um,
+            marks=found,
+            **of_layout(layout, (levels.shape[0], levels.shape[1])),
+            **of_job(made, format),
+            **of_design(source.folder, source.design),
+        )
         record.write(temporary).rename(sidecar_path(file))
         back = exported_rows(file, record.model_dump())
-        if not all(np.array_equal(back[rows], written[rows]) for rows in bands_of(written, _BAND_PX)):
+        if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
         # The sidecar is written last, because a file without it, or with an older one, is refused.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
@@ -214,22 +204,28 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
             )
 
 
-def _write(file: Path, job: Sidecar, levels: LevelRows) -> None:
-    pitch_um, step_um = job.pitch_um, job.level_height_um
-    if job.format == "stl":
-        cells = levels[:: job.cell_px][:, :: job.cell_px]
-        write_stl(file, cells, job.cell_px * pitch_um, step_um, job.pedestal_um)
-    elif job.format == "gds":
-        assert job.gds_layers is not None
-        write_gds(file, levels, pitch_um, job.gds_layers, None if job.marks is None else job.marks.parts())
-    elif job.format == "tiff":
-        write_tiff(file, levels, pitch_um, step_um)
-    elif job.format == "gwl":
-        assert job.gwl is not None
-        write_gwl(file, levels, pitch_um, step_um, job.pedestal_um, job.slicing_um, job.hatching_um, job.gwl)
-    else:
-        assert job.greys is not None
-        if job.format == "dxf":
-            write_dxf(file, levels, pitch_um, job.greys)
-        else:
-            write_image(file, levels[:], job.greys, step_um)
+def _write(
+    file: Path,
+    format: Format,
+    levels: LevelRows,
+    layout: LayoutSettings,
+    job: PrintJob,
+    greys: list[int] | None,
+    marks: Marks | None,
+) -> None:
+    pitch_um, step_um = layout.pitch_um, layout.level_height_um
+    match format:
+        case "stl":
+            cell_px = cell_of(layout)
+            cells = levels[::cell_px][:, ::cell_px]
+            write_stl(file, cells, cell_px * pitch_um, step_um, job.pedestal_um)
+        case "gds":
+            write_gds(file, levels, pitch_um, job.gds_layers, None if marks is None else marks.parts())
+        case "tiff":
+            write_tiff(file, levels, pitch_um, step_um)
+        case "gwl":
+            write_gwl(file, levels, pitch_um, step_um, job)
+        case "dxf":
+            write_dxf(file, levels, pitch_um, greys or [])
+        case _:
+            write_image(file, levels[:], greys or [], step_um)

@@ -6,10 +6,11 @@ import hashlib
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from litho_design.exports.job import GdsLayers
 from litho_design.exports.rows import LevelRows
 
 _UNIT_M = 1e-6
@@ -17,7 +18,6 @@ _PRECISION_M = 1e-9
 
 # Side of the blocks that a part is cut into.
 _BLOCK_PX = 128
-GdsLayers = Literal["cumulative", "exclusive"]
 Box = tuple[int, int, int, int]
 
 

@@ -4,41 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from litho_data.commands.settings import setting
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.results import Record
+from litho_design.exports.job import Gwl, PrintJob
 from litho_design.exports.rows import LevelRows
 
 # Range of the piezo of a Photonic Professional along x and y.
 _PIEZO_UM = 300.0
 
 
-class Gwl(Record):
-    """How a Nanoscribe prints the slices."""
-
-    mode: Literal["galvo", "piezo"] = setting("galvo", "What moves the focus: galvo or piezo")
-    field_um: float = setting(100.0, "Side of a write field of the galvo", unit="µm", gt=0)
-    speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", gt=0, le=1e7)
-    power_percent: tuple[float, ...] = setting(
-        (50.0,),
-        "Laser power, %: one number, or one for the pedestal and one for every level above it",
-    )
-
-
-def write_gwl(
-    path: Path,
-    levels: LevelRows,
-    pitch_um: float,
-    level_height_um: float,
-    pedestal_um: float,
-    slicing_um: float,
-    hatching_um: float,
-    job: Gwl,
-) -> int:
+def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
     """Write the slices from the pedestal up, field by field; returns the number of lines.
 
     A slice is written at the middle of its thickness, a row at the middle of its hatching distance, and a
@@ -51,32 +28,27 @@ def write_gwl(
             range of the piezo.
     """
     height, width = levels.shape
-    thick, base, rows_per_px = (
-        _whole(name, whole / part)
-        for name, whole, part in (
-            ("slices of a level", level_height_um, slicing_um),
-            ("slices of the pedestal", pedestal_um, slicing_um),
-            ("hatching distances of a pixel", pitch_um, hatching_um),
-        )
-    )
-    if job.mode == "piezo" and max(height, width) * pitch_um > _PIEZO_UM:
+    gwl, slicing_um, hatching_um = job.gwl, job.slicing_um, job.hatching_um
+    thick = _whole("slices of a level", level_height_um / slicing_um)
+    base = _whole("slices of the pedestal, pedestal_um over slicing_um", job.pedestal_um / slicing_um)
+    rows_per_px = _whole("hatching distances of a pixel", pitch_um / hatching_um)
+    if gwl.mode == "piezo" and max(height, width) * pitch_um > _PIEZO_UM:
         size = f"an element of {max(height, width) * pitch_um:g} µm"
         raise InputError("piezo mode", got=size, wanted=f"at most {_PIEZO_UM:g} µm", hint="--gwl-mode galvo")
-    field_px = max(1, round(job.field_um / pitch_um)) if job.mode == "galvo" else max(height, width)
+    field_px = max(1, round(gwl.field_um / pitch_um)) if gwl.mode == "galvo" else max(height, width)
     lines, at_um = 0, np.zeros(2)
     with open(path, "w", encoding="ascii") as stream:
-        stream.write(_head(job))
+        stream.write(_head(gwl))
         for top, left in np.ndindex(-(-height // field_px), -(-width // field_px)):
-            bottom, right = min((top + 1) * field_px, height), min((left + 1) * field_px, width)
-            part = levels[top * field_px : bottom][:, left * field_px : right]
-            corner_um = np.array([left * field_px, height - bottom]) * pitch_um
-            if job.mode == "galvo":
+            part = levels[top * field_px : (top + 1) * field_px][:, left * field_px : (left + 1) * field_px]
+            corner_um = np.array([left * field_px, height - top * field_px - len(part)]) * pitch_um
+            if gwl.mode == "galvo":
                 middle_um = corner_um + np.array(part.shape[::-1]) / 2 * pitch_um
                 for axis, move_um in zip("XY", (middle_um - at_um).tolist(), strict=True):
                     stream.write(f"MoveStage{axis} {move_um:.4f}\n")
                 at_um, corner_um = middle_um, corner_um - middle_um
             highest = int(part.max())
-            powers = _powers(job, highest)
+            powers = _powers(gwl, highest)
             for number in range(base + thick * highest):
                 level = 0 if number < base else (number - base) // thick + 1
                 stream.write(f"LaserPower {powers[level]:g}\n")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,39 +31,32 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
     return [level * step for level in range(layout.levels)]
 
 
-def measured_greys(file: str | Path) -> Callable[[LayoutSettings, int], list[int]]:
+def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
     """Greys for which the printer's measured heights equal those of the levels, up to a constant height.
 
     Args:
-        file: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
+        curve: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
 
     Raises:
-        InputError: no such table; raised by the result: a level beyond the heights, or two levels of one
-            grey.
+        InputError: no such table, a level beyond the heights, or two levels of one grey.
     """
     try:
-        table = np.genfromtxt(file, delimiter=",", names=True, dtype=float)
+        table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))
         grey, height_um = table["grey"], table["height_um"]
-        rising = (
-            grey.ndim == 1 and len(grey) > 1 and (np.diff(grey) > 0).all() and (np.diff(height_um) > 0).all()
-        )
+        rising = len(grey) > 1 and all((np.diff(one) > 0).all() for one in (grey, height_um))
     except (OSError, ValueError, IndexError):
         rising = False
     if not rising:
         wanted = "a CSV with the rising columns grey and height_um"
-        raise InputError("dose curve", got=str(file), wanted=wanted)
-
-    def greys(layout: LayoutSettings, bits: int) -> list[int]:
-        heights = height_um[0] + np.arange(layout.levels) * layout.level_height_um
-        found = np.rint(np.interp(heights, height_um, grey)).astype(int)
-        if heights[-1] > height_um[-1] + 1e-9 or len(set(found.tolist())) < layout.levels:
-            got = f"{np.ptp(height_um):.3g} µm for levels up to {heights[-1] - heights[0]:.3g} µm"
-            raise InputError("dose curve", got=got, wanted="a different grey for every level")
-        if found[0] < 0 or found[-1] >= 2**bits:
-            raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
-        return [int(one) for one in found]
-
-    return greys
+        raise InputError("dose curve", got=str(curve), wanted=wanted)
+    heights = height_um[0] + np.arange(layout.levels) * layout.level_height_um
+    found = np.rint(np.interp(heights, height_um, grey)).astype(int).tolist()
+    if heights[-1] > height_um[-1] + 1e-9 or len(set(found)) < layout.levels:
+        got = f"{np.ptp(height_um):.3g} µm for levels up to {heights[-1] - heights[0]:.3g} µm"
+        raise InputError("dose curve", got=got, wanted="a different grey for every level")
+    if found[0] < 0 or found[-1] >= 2**bits:
+        raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
+    return found
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_design.exports.rows import LevelRows, SideBySide
+from litho_design.exports.rows import LevelRows
 from litho_design.printers.layout import LayoutSettings
 
 Box = tuple[int, int, int, int]
@@ -40,7 +40,7 @@ class Marks(Record):
 
 def with_marks(
     levels: LevelRows, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
-) -> tuple[SideBySide, Marks]:
+) -> tuple[np.ndarray, Marks]:
     """The level map (size, size) with an F and a square of the highest level to the right of it.
 
     Both are at least the printer's reach away from the element and from each other, so that none changes the
@@ -75,7 +75,7 @@ def with_marks(
     beside = np.zeros((size, gap + max(side, letter.shape[1])), np.uint8)
     beside[: len(letter), gap : gap + letter.shape[1]] = top_level * letter
     beside[size - side :, gap : gap + side] = top_level
-    return SideBySide(levels, beside), Marks(
+    return np.concatenate([levels[:], beside], axis=1), Marks(
         element_px=(0, size, 0, size),
         orientation_px=(0, len(letter), left, left + letter.shape[1]),
         witness_px=(size - side, size, left, left + side),

@@ -47,22 +47,6 @@ class RingRows:
         return np.concatenate([right[:, ::-1], right], axis=1)
 
 
-@dataclass(frozen=True)
-class SideBySide:
-    """Two maps of equal height, the second to the right of the first."""
-
-    left: LevelRows
-    right: LevelRows
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(ny, nx)."""
-        return self.left.shape[0], self.left.shape[1] + self.right.shape[1]
-
-    def __getitem__(self, rows: slice) -> np.ndarray:
-        return np.concatenate([self.left[rows], self.right[rows]], axis=1)
-
-
 def layout_rows(folder: str | Path) -> LevelRows:
     """The layout of a design folder, checked against the hash in its record; it stays on disk.
 

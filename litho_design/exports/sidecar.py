@@ -8,17 +8,16 @@ from typing import Any, ClassVar, Literal
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
-from litho_design.exports.formats import Format
-from litho_design.exports.gwl import Gwl
+from litho_design.exports.job import Format, GdsLayers, Gwl, PrintJob
 from litho_design.exports.marks import Marks
 from litho_design.optics.stroke import Stroke
-from litho_design.printers.layout import LayoutSettings, Printability
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import PrinterRecord
 from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.design import Design
 
 # Fields that a sidecar copies from the record of its design.
-_OF_DESIGN = ("printer", "stroke", "printability", "out_of_distribution", "predicted", "settings")
+_OF_DESIGN = ("printer", "stroke", "out_of_distribution", "predicted", "settings")
 
 
 class Sidecar(Result):
@@ -26,6 +25,7 @@ class Sidecar(Result):
 
     SCHEMA: ClassVar[str] = "litho-design/export/2"
     FILE_NAME: ClassVar[str] = "export.json"
+    FORMER: ClassVar[frozenset[str]] = frozenset({"printability"})
 
     file: str
     file_sha256: str
@@ -47,7 +47,7 @@ class Sidecar(Result):
     # linear.
     greys: list[int] | None
     white_height_um: float | None
-    gds_layers: Literal["cumulative", "exclusive"] | None
+    gds_layers: GdsLayers | None
     gwl: Gwl | None
     row_0: Literal["top"] = "top"
     x_direction: Literal["right"] = "right"
@@ -60,10 +60,14 @@ class Sidecar(Result):
     design_sha256: str | None = None
     printer: PrinterRecord | None = None
     stroke: Stroke | None = None
-    printability: Printability | None = None
     out_of_distribution: OutOfDistribution | None = None
     predicted: dict[str, float] | None = None
     settings: dict[str, Any] | None = None
+
+
+def cell_of(layout: LayoutSettings) -> int:
+    """Side in pixels of the squares of one level, which a ring layout does not have."""
+    return 1 if layout.symmetry == "radial" else layout.cell_px
 
 
 def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, Any]:
@@ -71,7 +75,7 @@ def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, An
     return {
         "shape_px": shape_px,
         "pitch_um": layout.pitch_um,
-        "cell_px": 1 if layout.symmetry == "radial" else layout.cell_px,
+        "cell_px": cell_of(layout),
         "size_um": (shape_px[0] * layout.pitch_um, shape_px[1] * layout.pitch_um),
         "levels": layout.levels,
         "level_height_um": layout.level_height_um,
@@ -80,8 +84,19 @@ def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, An
     }
 
 
-def of_design(folder: Path, design: Design) -> dict[str, Any]:
-    """Fields of the sidecar that only a design knows."""
+def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
+    """Fields of the sidecar for a print job; those of another format are None."""
+    return {
+        **job.model_dump(include={"pedestal_um", "slicing_um", "hatching_um"}),
+        "gds_layers": job.gds_layers if format == "gds" else None,
+        "gwl": job.gwl if format == "gwl" else None,
+    }
+
+
+def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
+    """Fields of the sidecar that come from a design; empty without one."""
+    if folder is None or design is None:
+        return {}
     shared = {name: getattr(design, name) for name in _OF_DESIGN}
     return {"design_sha256": file_sha256(folder / Design.FILE_NAME), **shared}
 

@@ -1,4 +1,4 @@
-"""Scores to compare a hologram's with, on the same grid: of a black image, and of ideal elements."""
+"""Baseline scores of a hologram on the same grid: of a black image, and of ideal elements."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from litho_design.holograms.loss import counted_pixels, hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import likeness, si_psnr_db
 from litho_design.optics import element_field, intensity_share
+from litho_design.optimisation.descent import descended
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.phases import gerchberg_saxton
 
@@ -54,10 +55,10 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Power on the signal {T > 0.5} of the phase of most power that is found from a print (size, size).
+    """Power on the signal {T > 0.5} of a phase that is optimised for this power from a print (size, size).
 
-    u <- exp(j arg P^H S P u), with S the signal and one phase per pixel: because P^H S P is positive, no step
-    lowers the share, so the result is never below the print's own.
+    Each step is u <- exp(j arg P^H S P u), with S the signal and one phase per pixel. P^H S P is positive, so
+    no step lowers the share, and the result is never below the print's share.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)
@@ -89,27 +90,18 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
     return wave / (wave.abs().square().sum() * area).sqrt()
 
 
-# This search needs gradients, even if the caller disabled them, as scores mostly do.
-@torch.enable_grad()
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
     """The phase per cell with the lowest loss, radian, and that loss."""
-    wave_um = settings.optics.wave_height_um
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
         counted=counted,
     )  # fmt: skip
     free = phase.clone().requires_grad_()
-    optimiser = torch.optim.Adam([free], lr=_PHASE_RATE)
-    best, lowest = phase, math.inf
-    for _ in range(_PHASE_ITERATIONS):
-        seen = bench(cells(free) * (wave_um / (2 * math.pi)))
-        loss, _ = hologram_loss(seen, target, settings.loss, counted)
-        value = float(loss.detach())
-        if value < lowest:
-            best, lowest = free.detach().clone(), value
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    return best, lowest
+
+    def loss() -> tuple[Tensor, Tensor]:
+        seen = bench(cells(free) * (settings.optics.wave_height_um / (2 * math.pi)))
+        return hologram_loss(seen, target, settings.loss, counted)[0], free.detach().clone()
+
+    return descended([free], loss, rate=_PHASE_RATE, iterations=_PHASE_ITERATIONS)

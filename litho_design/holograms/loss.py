@@ -1,4 +1,4 @@
-"""What a hologram is optimised for.
+"""The loss of a hologram.
 
 To add a term, give it a weight in ``HologramLoss`` and a line in ``hologram_loss``.
 """
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 class HologramLoss(Record):
     """RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
-    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; beyond
-    them, light is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
+    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; light
+    beyond them is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
     doi:10.1364/OE.16.002176). ``scale`` matches the image to the target: ``paper`` divides by the mean over
-    the wanted light, ``least-squares`` uses the factor of least error. The efficiency is the share of the
-    incident power on pixels whose target is above zero.
+    the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is the share
+    of the incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(

@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.signal import correlate
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
+from litho_design.images.measurements import PhotoSource
 from litho_design.images.noise import DRAWS, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
@@ -89,29 +91,6 @@ class CameraRecord(Record):
         if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
             found.append(f"counts look like the light to the power {self.gamma:.2f}: is the file raw?")
         return found
-
-
-@dataclass(frozen=True)
-class PhotoSource:
-    """A photograph, its pixel in the image plane, and its dark level if known.
-
-    Attributes:
-        imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
-        orientation: the operation that makes it upright, if the camera turned or mirrored it.
-        power_counts: summed counts, without dark level, of all light that falls on the element, at the same
-            exposure; needed for efficiencies.
-        pitch_sd: relative standard uncertainty of the pitch, if the magnification is uncertain.
-        flat: photograph of uniform light by the same camera, which removes vignetting.
-    """
-
-    path: Path
-    pitch_um: float
-    dark_level: float | None = None
-    imaged: str | None = None
-    orientation: str = "identity"
-    power_counts: float | None = None
-    pitch_sd: float = 0.0
-    flat: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -508,9 +487,10 @@ def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -
 
 def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
     """The pixels of the window (side, side) that lie on the photograph."""
-    y, x = np.mgrid[:side, :side].astype(float)
-    at_x, at_y, w = np.tensordot(warp, np.stack([x, y, np.ones_like(x)]), 1)
-    return (np.abs(2 * at_x / w - shape[1] + 1) < shape[1]) & (np.abs(2 * at_y / w - shape[0] + 1) < shape[0])
+    import cv2
+
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(np.ones(shape[:2], np.uint8), warp, (side, side), flags=flags) > 0
 
 
 def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
@@ -521,8 +501,6 @@ def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Shift (x, y) of ``moving`` (n, n) in whole pixels, by the maximum of the correlation."""
-    n = len(reference)
-    spectra = [np.fft.rfft2(image - image.mean(), s=(2 * n, 2 * n)) for image in (moving, reference)]
-    correlation = np.fft.irfft2(spectra[0] * spectra[1].conj())
+    correlation = correlate(moving - moving.mean(), reference - reference.mean(), method="fft")
     y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)
-    return np.array([x - 2 * n * (x > n), y - 2 * n * (y > n)])
+    return np.array([x, y]) - (len(reference) - 1)

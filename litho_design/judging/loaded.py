@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.reports.pictures import shown_html
 from litho_design.holograms.task import HologramTask
+from litho_design.large.bands import BAND_PX, Bands
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.lens import RingLens
 from litho_design.lenses.task import LensTask
 from litho_design.optics.thin_element import ElementKind
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import check_device
 from litho_design.reliefs.task import UNPRINTABLE_FILE
-from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design, read_array
+from litho_design.tasks.design import (
+    HEIGHT_FILE,
+    IMAGE_FILE,
+    LEVELS_FILE,
+    RING_HEIGHT_FILE,
+    RINGS_FILE,
+    Design,
+    read_array,
+)
 from litho_design.tasks.task import Task, registered_task
 
 
@@ -33,17 +46,24 @@ class LoadedDesign:
         bench: the optics, from a height map to an image or a PSF.
 
     Args:
-        folder: a design folder; its arrays are checked against the hashes in the record.
+        folder: a design folder; its arrays are checked against the hashes in the record. A lens of rings has
+            levels and heights along a radius instead of a plane.
         device: where prints and waves are computed.
         element: ``thin`` or ``thick`` instead of the design's own (see ``Optics``).
+        band_px: most rows of a band, to print and score a large hologram band by band.
 
     Raises:
-        InputError: an incomplete or altered folder, a task that is not registered here, or a device that
-            this machine does not have.
+        InputError: an incomplete or altered folder, a task that is not registered here, a device that this
+            machine does not have, or bands for anything but a thin hologram.
     """
 
     def __init__(
-        self, folder: str | Path, *, device: str | torch.device = "cpu", element: ElementKind | None = None
+        self,
+        folder: str | Path,
+        *,
+        device: str | torch.device = "cpu",
+        element: ElementKind | None = None,
+        band_px: int | None = None,
     ):
         check_device(device)
         self.folder, self.record = Path(folder), Design.read(folder)
@@ -52,17 +72,29 @@ class LoadedDesign:
             settings = self.record.settings | {"optics": optics.model_dump()}
             self.record = self.record.model_copy(update={"optics": optics, "settings": settings})
         self.device = torch.device(device)
-        self.level, self.expected_um = (self._tensor(name) for name in (LEVELS_FILE, HEIGHT_FILE))
-        own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, UNPRINTABLE_FILE}
-        arrays = [name for name in self.record.files if name.endswith(".npy") and name not in own]
-        # The design is only scored, so its task needs a device but no model.
-        nominal = Printer(None, self.record.layout, source="none").to(self.device)
-        kind = registered_task(self.record.task)
-        inputs = {name.removesuffix(".npy"): read_array(folder, name) for name in arrays}
-        made = kind.settings_type.model_validate(self.record.settings)
-        self.task: Task = kind(made, nominal, inputs=inputs)
+        of_rings = self.record.in_rings
+        arrays = (RINGS_FILE, RING_HEIGHT_FILE) if of_rings else (LEVELS_FILE, HEIGHT_FILE)
+        self.level, self.expected_um = (self._tensor(name) for name in arrays)
+        self.task = self._task(band_px)
         self.bench = self.task.bench
-        self.target = self.task.target if isinstance(self.task, HologramTask) else None
+        whole = isinstance(self.task, HologramTask) and self.task.in_one_piece
+        self.target: Tensor | None = getattr(self.task, "target", None) if whole else None
+
+    def _task(self, band_px: int | None) -> Task:
+        """The task of the design. It only scores, so it needs a device but no model."""
+        record, kind = self.record, registered_task(self.record.task)
+        nominal = Printer(None, record.layout, source="none").to(self.device)
+        made: Any = kind.settings_type.model_validate(record.settings)
+        if record.in_rings:
+            return RingLens(made, nominal, BAND_PX)
+        own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, UNPRINTABLE_FILE}
+        names = [name for name in record.files if name.endswith(".npy") and name not in own]
+        inputs = {name.removesuffix(".npy"): read_array(self.folder, name) for name in names}
+        if band_px is None:
+            return kind(made, nominal, inputs=inputs)
+        if kind is not HologramTask:
+            raise InputError("design to score in bands", got=record.task, wanted="a hologram")
+        return BandedHologram(made, nominal, Bands(record.layout.size_px, band_px), inputs=inputs)
 
     def __repr__(self) -> str:
         pitch_um, printer = self.record.layout.pitch_um, self.record.printer.name
@@ -73,12 +105,14 @@ class LoadedDesign:
 
     def _repr_html_(self) -> str:
         maps = {"layout (level)": self.level, "expected_height_um": self.expected_um}
-        return shown_html(repr(self), **{name: one.cpu().numpy().astype(float) for name, one in maps.items()})
+        shown = {name: np.atleast_2d(one.cpu().numpy()).astype(float) for name, one in maps.items()}
+        return shown_html(repr(self), **shown)
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
         """Height (size, size), µm, of the layout as printed by ``judge``."""
-        return judge(self.level[None, None].float())[0, 0]
+        self.task.check_printer(judge)
+        return self.task.printed_um(self.level, judge)
 
     @torch.no_grad()
     def image(self, height_um: Tensor) -> np.ndarray:

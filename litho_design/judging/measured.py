@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -15,10 +15,9 @@ from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.scan import Scan
+from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
-
-Levelling = Literal["none", "plane", "bow"]
 
 # With fewer measured pixels the score would describe the filled-in part more than the print.
 _SMALLEST_COVERAGE = 0.8
@@ -29,28 +28,6 @@ _SMALLEST_FOR_TIP = 64
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # This share of the change by a tip remains uncertain.
 _TIP_SD = 0.3
-
-
-@dataclass(frozen=True)
-class MeasuredSource:
-    """A height map of the printed part; unit and size for files that do not state them.
-
-    Attributes:
-        levelling: what is removed from the scan: nothing, a plane, or a polynomial of second order (bow).
-        scale_sd: relative standard uncertainty of its heights; a calibrated microscope's is about 0.02.
-        aligned: the scan already lies on the pixels of the element, upright, and is not registered. For
-            elements that look alike in several places or orientations, such as a lens cap or a blaze.
-        tip_um: radius of the microscope's tip, whose widening of the print is removed; 0 for none, None to
-            estimate it from the scan.
-    """
-
-    path: Path
-    unit: str | None = None
-    size_um: tuple[float, float] | None = None
-    levelling: Levelling = "bow"
-    scale_sd: float = 0.02
-    aligned: bool = False
-    tip_um: float | None = None
 
 
 class MeasuredRecord(Record):
@@ -128,7 +105,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     if not source.scale_sd >= 0:
         raise InputError("uncertainty of the height scale", got=source.scale_sd, wanted="0 or more")
     layout = loaded.record.layout
-    scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)
+    size_um = (source.size_um,) * 2 if isinstance(source.size_um, float) else source.size_um
+    scan = read_scan(source.path, unit=source.unit, size_um=size_um)
     place = _as_it_lies if source.aligned else _registered
     scan, tip_um, tip_change_um = _without_tip(scan, source.tip_um)
     placed = place(scan, loaded.level.cpu().numpy(), layout.pitch_um)

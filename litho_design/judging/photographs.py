@@ -14,13 +14,14 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
+from litho_design.images.measurements import PhotoSource
 from litho_design.images.noise import freed_of_noise, uncertainties
-from litho_design.images.photograph import CameraRecord, Photograph, PhotoSource, photographed_image
+from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
-from litho_design.images.targets import ImagedObject
+from litho_design.images.targets import ImagedObject, object_name
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import sensor_psf
-from litho_design.lenses.objects import object_name, object_stack, read_object
+from litho_design.lenses.objects import object_stack, read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 

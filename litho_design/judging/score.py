@@ -5,23 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
-from litho_design.images.noise import DRAWS, uncertainties
-from litho_design.images.photograph import CameraRecord, PhotoSource
+from litho_design.images.measurements import MeasuredSource, PhotoSource
+from litho_design.images.noise import uncertainties
+from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
+from litho_design.judging.measured import MeasuredRecord, as_it_might_be, measured_print
 from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
-from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.tasks.design import Design
@@ -31,9 +32,9 @@ class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
     ``uncertainty`` holds one standard deviation of a measured figure; None for models.
-    With ``stitching`` the print is made of displaced write fields: figures are means over some draws of the
-    displacements, uncertainties the standard deviation of one draw.
     """
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"stitching"})
 
     kind: Literal["model", "scan", "camera"]
     judge: PrinterRecord | MeasuredRecord | CameraRecord
@@ -42,36 +43,10 @@ class JudgedScore(Record):
     rms_height_difference_um: float | None
     figures: dict[str, float]
     uncertainty: dict[str, float] | None = None
-    stitching: Stitching | None = None
-
-    @classmethod
-    def of_print(
-        cls,
-        design: Design,
-        judge: PrinterRecord | MeasuredRecord,
-        differences_um: tuple[float, float],
-        figures: dict[str, float],
-        **more: Any,
-    ) -> JudgedScore:
-        """The figures of a predicted or measured print; mean and rms of its height minus the designed one."""
-        model = isinstance(judge, PrinterRecord)
-        return cls(
-            kind="model" if model else "scan",
-            judge=judge,
-            independent=not model or judge.sha256 != design.printer.sha256,
-            mean_height_difference_um=differences_um[0],
-            rms_height_difference_um=differences_um[1],
-            figures=figures,
-            **more,
-        )
 
     def remarks(self) -> list[str]:
         """Remarks on how a measurement was processed and what is uncertain about it, one phrase each."""
-        found = [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
-        if self.stitching is not None:
-            sigma_um, field_um = self.stitching.sigma_um, self.stitching.field_um
-            found.append(f"write fields of {field_um:g} µm lie off their places by {sigma_um:g} µm (sd)")
-        return found
+        return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
 class ScoreResult(RunFacts, Result):
@@ -138,7 +113,6 @@ def judge_design(
     judges: Sequence[Printer],
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
-    stitch: Stitching | None = None,
 ) -> Judgement:
     """Score the layout of a design as printed by models, as measured, and as photographed.
 
@@ -147,7 +121,6 @@ def judge_design(
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
-        stitch: write fields of the models' prints; by default they are printed in one piece.
 
     Raises:
         InputError: a measurement that does not match the design.
@@ -157,17 +130,11 @@ def judge_design(
     photos: dict[str, np.ndarray] = {}
     for judge in judges:
         height, record = loaded.printed_um(judge), judge.record()
-        if stitch is not None:
-            pitch_um = loaded.record.layout.pitch_um
-            drawn = [stitch.drawn(height, pitch_um, [seed]) for seed in range(DRAWS)]
-            scores.append(_stitched_score(loaded, record, drawn, stitch))
-            height = drawn[0]
-        else:
-            scores.append(_height_score(loaded, record, height))
+        scores.append(_print_score(loaded, record, height))
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
         printed_um, measured = measured_print(loaded, scan)
-        scores.append(_height_score(loaded, measured, printed_um))
+        scores.append(_print_score(loaded, measured, printed_um))
         pictures[f"measured print {measured.name}"] = loaded.image(printed_um)
     if camera is not None:
         of_lens = isinstance(loaded.task, LensTask)
@@ -195,31 +162,23 @@ def judge_design(
     return Judgement(scores, shown, loaded.window_um, photos, loaded.frame_um)
 
 
-def _stitched_score(
-    loaded: LoadedDesign, judge: PrinterRecord, drawn: list[Tensor], stitch: Stitching
-) -> JudgedScore:
-    scores = [_height_score(loaded, judge, height) for height in drawn]
-    figures = {name: [score.figures[name] for score in scores] for name in scores[0].figures}
-    mean_um, rms_um = (
-        float(np.mean([getattr(score, f"{what}_height_difference_um") for score in scores]))
-        for what in ("mean", "rms")
-    )
-    return scores[0].model_copy(
-        update={
-            "figures": {name: float(np.mean(values)) for name, values in figures.items()},
-            "uncertainty": {name: float(np.std(values, ddof=1)) for name, values in figures.items()},
-            "mean_height_difference_um": mean_um,
-            "rms_height_difference_um": rms_um,
-            "stitching": stitch,
-        }
-    )
-
-
-def _height_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
-    difference, figures = height - loaded.expected_um, loaded.score(height)
-    spread = None
+def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
+    """The figures of a predicted or measured print, and its height minus the designed one."""
+    figures, spread = loaded.score(height), None
+    measured = isinstance(judge, MeasuredRecord)
     if isinstance(judge, MeasuredRecord):
         variants = as_it_might_be(height, judge, loaded.record.layout.pitch_um)
         spread = uncertainties(loaded.score, figures, variants)
-    off_um = float(difference.mean()), float(difference.square().mean().sqrt())
-    return JudgedScore.of_print(loaded.record, judge, off_um, figures.model_dump(), uncertainty=spread)
+    off = (height - loaded.expected_um).double()
+    in_rings = loaded.record.in_rings
+    area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)
+    share = area / area.sum()
+    return JudgedScore(
+        kind="scan" if measured else "model",
+        judge=judge,
+        independent=measured or judge.sha256 != loaded.record.printer.sha256,
+        mean_height_difference_um=float((off * share).sum()),
+        rms_height_difference_um=float((off.square() * share).sum().sqrt()),
+        figures=figures.model_dump(),
+        uncertainty=spread,
+    )

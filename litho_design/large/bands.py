@@ -1,4 +1,4 @@
-"""Bands of rows, the unit in which a large element is printed and transformed, and their processes.
+"""Bands of rows, the unit in which a large element is printed and transformed.
 
 The bands depend only on the layout: an element has the same bands with the same numbers, whether one process
 computes them or many.
@@ -6,99 +6,19 @@ computes them or many.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
+from litho_design.optimisation.ranks import ALONE, Ranks
+from litho_design.printers.printer import Printer
 
 # Most rows of a band. Memory for a print grows with their square, and an element cannot be shared by more
 # processes than it has bands. Below about four times the model's reach, most of the time goes into rows that
 # are printed twice.
 BAND_PX = 512
-
-
-@dataclass(frozen=True)
-class Ranks:
-    """The processes that share an element: those that torchrun started, or this one alone."""
-
-    rank: int = 0
-    count: int = 1
-
-    @classmethod
-    def joined(cls) -> Ranks:
-        """Join the processes of torchrun, over gloo for processors and NCCL for GPUs; alone without it."""
-        if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-            return cls()
-        if not dist.is_initialized():
-            if torch.cuda.is_available():
-                torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-            dist.init_process_group()
-        return cls(dist.get_rank(), dist.get_world_size())
-
-    def device(self, device: str | torch.device) -> str | torch.device:
-        """``device`` for this process; with ``cuda`` each process takes a GPU of its own."""
-        return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
-
-    def share(self, count: int, rank: int | None = None) -> range:
-        """The range among ``count`` items that belongs to a process, by default this one."""
-        place = self.rank if rank is None else rank
-        return range(count * place // self.count, count * (place + 1) // self.count)
-
-    def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated flat.
-
-        Args:
-            parts: one tensor per process, real or complex, of one dtype.
-        """
-        if self.count == 1:
-            return parts[0].reshape(-1)
-        sent = torch.cat([part.reshape(-1) for part in parts])
-        received = sent.new_empty(sum(sizes))
-        # The collectives of gloo do not support complex numbers.
-        to, of = (torch.view_as_real(one) if one.is_complex() else one for one in (received, sent))
-        dist.all_to_all_single(to, of, list(sizes), [part.numel() for part in parts])
-        return received
-
-    def total(self, values: Tensor) -> Tensor:
-        """Sum over the values of all processes in double precision, () float64.
-
-        Differentiable: the gradient adds up what every process does with the sum (see ``shared_loss``).
-        """
-        total: Tensor = _Total.apply(values.sum(dtype=torch.float64), self)
-        return total
-
-    def shared_loss(self, loss: Tensor) -> Tensor:
-        """A loss that all processes share; its gradient is scaled so that the loss counts once."""
-        return (loss - loss.detach()) / self.count + loss.detach()
-
-    def wait(self) -> None:
-        """Wait until all processes are here."""
-        if self.count > 1:
-            dist.barrier()
-
-
-class _Total(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, ranks: Ranks) -> Tensor:
-        ctx.ranks = ranks
-        return _summed(value, ranks)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return _summed(gradient, ctx.ranks), None
-
-
-def _summed(value: Tensor, ranks: Ranks) -> Tensor:
-    total = value.clone()
-    if ranks.count > 1:
-        dist.all_reduce(total)
-    return total
 
 
 @dataclass(frozen=True)
@@ -117,7 +37,7 @@ class Bands:
 
     size_px: int
     most_px: int
-    ranks: Ranks = Ranks()
+    ranks: Ranks = ALONE
     cell_px: int = 1
 
     def __post_init__(self) -> None:
@@ -168,33 +88,32 @@ class Bands:
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
         """The own rows (rows, x) with ``halo`` rows of the neighbours on both sides, zero beyond the element.
 
-        ``add_halo`` is its adjoint.
+        At most two bands contribute to the gradient of a row, so the sum is the same in any order.
         """
-        around = torch.nn.functional.pad(values, (0, 0, halo, halo))
-        if halo:
-            before, after = self._from_neighbours(values[:halo], values[-halo:])
-            around[:halo] += before
-            around[-halo:] += after
-        return around
-
-    def add_halo(self, around: Tensor, halo: int) -> Tensor:
-        """Add to the own rows what neighbours computed for them; each sends ``halo`` rows to their owner."""
-        own = around[halo : len(around) - halo].clone()
-        if halo:
-            before, after = self._from_neighbours(around[:halo], around[-halo:])
-            own[:halo] += before
-            own[-halo:] += after
-        return own
-
-    def _from_neighbours(self, first: Tensor, last: Tensor) -> list[Tensor]:
-        """What the neighbouring processes send: each sends ``first`` and ``last`` to its own neighbours."""
         rank, count = self.ranks.rank, self.ranks.count
-        parts, sizes = [first[:0]] * count, [0] * count
-        sides = {rank - 1: first, rank + 1: last}
-        for other in sides.keys() & set(range(count)):
-            parts[other], sizes[other] = sides[other], sides[other].numel()
+        # The neighbour above needs the first rows, the one below the last.
+        ends = {rank - 1: values[:halo], rank + 1: values[len(values) - halo :]}
+        parts = [ends.get(other, values[:0]) for other in range(count)]
+        sizes = [part.numel() for part in parts]
         got = self.ranks.exchange(parts, sizes).split(sizes)
-        return [
-            got[other].reshape(first.shape) if 0 <= other < count else torch.zeros_like(first)
-            for other in sides
-        ]
+        above, below = (
+            got[other].reshape(rows.shape) if 0 <= other < count else torch.zeros_like(rows)
+            for other, rows in ends.items()
+        )
+        return torch.cat([above, values, below])
+
+
+def require_reach(printer: Printer) -> None:
+    """Refuse a printer that cannot print an element in parts.
+
+    Raises:
+        InputError: a print that depends on the whole image or on the position in the write field.
+    """
+    whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
+    if whole or printer.depends_on_position:
+        why = "the whole image" if whole else "the place in the write field"
+        raise InputError(
+            f"printer {printer.name} of a large element",
+            got=f"a print that depends on {why}",
+            wanted="a model with a finite reach, such as zoo:pbl, or none",
+        )

@@ -13,30 +13,14 @@ import numpy as np
 from litho_design.images.similarity import SSIM_WINDOW_PX, ssim_map
 from litho_design.large.bands import Bands
 
-_PREVIEW_PX = 1024
-
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
     """Figures of an image (size, size), share of the incident power, against its target in [0, 1]."""
-    signal = paper = dark = power = square = both = wanted = wanted_square = lit_square = 0.0
-    lit = 0
-    for band in bands.own():
-        share, aim = (np.asarray(one[band], np.float64) for one in (image, target))
-        bright = aim > 0.5
-        lit += int(bright.sum())
-        signal += float(share[bright].sum())
-        lit_square += float(np.square(share[bright]).sum())
-        dark += float(share[~bright].sum())
-        paper += float(share[aim > 0].sum())
-        power += float(share.sum())
-        square += float(np.square(share).sum())
-        both += float((share * aim).sum())
-        wanted += float(aim.sum())
-        wanted_square += float(np.square(aim).sum())
-    pixels = bands.size_px**2
+    sums = np.sum([_sums(*_read(image, target, band)) for band in bands.own()], axis=0)
+    lit, signal, lit_square, dark, paper, power, square, both, wanted, wanted_square = sums.tolist()
+    pixels, mean = bands.size_px**2, signal / lit
     scale, average = both / max(square, 1e-300), both / wanted
     likeness, clipped = _likeness(image, target, scale, bands)
-    mean = signal / lit
     return {
         "eff_signal": signal,
         "eff_paper": paper,
@@ -50,14 +34,16 @@ def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[s
     }
 
 
-def preview(image: np.ndarray, bands: Bands) -> np.ndarray:
-    """The image reduced to about 1,024 px a side at most, by means over squares of pixels."""
-    step = -(-bands.size_px // _PREVIEW_PX)
-    side = bands.size_px // step
-    rows = [
-        np.asarray(image[row * step : (row + 1) * step, : side * step], np.float64) for row in range(side)
-    ]
-    return np.stack([row.reshape(step, side, step).mean((0, 2)) for row in rows])
+def _read(image: np.ndarray, target: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(image[rows], np.float64), np.asarray(target[rows], np.float64)
+
+
+def _sums(share: np.ndarray, aim: np.ndarray) -> list[float]:
+    """The sums over a band of rows from which figures of the whole image follow."""
+    bright = aim > 0.5
+    lit = share[bright]
+    maps = lit, lit**2, share[~bright], share[aim > 0], share, share**2, share * aim, aim, aim**2
+    return [bright.sum(), *(one.sum() for one in maps)]
 
 
 def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands) -> tuple[float, float]:
@@ -66,10 +52,10 @@ def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands)
     size, total, clipped = bands.size_px, 0.0, 0
     for band in bands.own():
         first, last = max(band.start - around, 0), min(band.stop + around, size)
-        seen = scale * np.asarray(image[first:last], np.float64)
+        seen, aim = _read(image, target, slice(first, last))
+        seen *= scale
         clipped += int((seen[band.start - first : band.stop - first] > 1).sum())
-        found = ssim_map(np.clip(seen, 0, 1), np.asarray(target[first:last], np.float64))
         # Windows that extend over the edge of the element do not count.
         inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
-        total += float(found[inner, around : size - around].sum())
+        total += float(ssim_map(seen.clip(0, 1), aim)[inner, around : size - around].sum())
     return total / (size - 2 * around) ** 2, clipped / size**2

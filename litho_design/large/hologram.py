@@ -2,49 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
+from litho_design.holograms.bench import zero_order_share
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
-from litho_design.images.targets import Target
-from litho_design.large.bands import Bands
+from litho_design.images.targets import TargetRecord
+from litho_design.large.bands import Bands, require_reach
 from litho_design.large.figures import image_figures
-from litho_design.large.printing import check_printer, print_bands
 from litho_design.large.propagator import BandedPropagator
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
-from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Findings
-from litho_design.tasks.task import Task
+from litho_design.tasks.task import Figures, Task
 
 _LEFT_OUT = (
     "a large element: without polish, process window, baselines, thick element and report; the figures that "
     "need the whole image at once are left out"
 )
-# A large element supports only these values of these settings.
-ONLY: dict[str, Any] = {
-    "search.parametrisation": "direct",
+_PREVIEW_PX = 1024
+# A large element supports only these values of these settings: for its light, and for its search.
+LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
     "optics.bandwidth_um": 0.0,
     "optics.beam_um": 0.0,
+}
+SEARCH: dict[str, Any] = {
+    "search.parametrisation": "direct",
     "window.samples": 0,
-    "fabrication.max_step_levels": 0,
-    "fabrication.min_feature_um": 0.0,
     "fabrication.inside_weight": 0.0,
     "layout.cell_filter_um": 0.0,
 }
+HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "none"}
 
 
 class BandedHologram(HologramTask):
@@ -54,28 +57,43 @@ class BandedHologram(HologramTask):
     depend on their number.
 
     Args:
-        settings: settings of the hologram.
+        settings: settings of the hologram; those of its search are checked by ``only``.
         printer: frozen model with a finite reach, or nominal heights.
-        target: wanted image (size, size) in [0, 1].
         bands: bands of the element.
+        inputs: ``target``, the wanted image (size, size) in [0, 1], in memory or on disk.
+        record: source of the target.
 
     Raises:
-        InputError: settings or a printer that a large element does not support.
+        InputError: light or a printer that a large element does not support.
     """
 
-    polished = reported = False
+    in_one_piece = False
 
-    def __init__(self, settings: HologramSettings, printer: Printer, target: Target, bands: Bands):
-        only(settings, ONLY | {"loss.signal_window_um": 0.0, "layout.symmetry": "none"})
-        check_printer(printer, bands)
-        ranks, rows = bands.ranks, bands.rows()
-        self.bands, self.total, self.leads = bands, ranks.total, ranks.rank == 0
-        self.part = f"-{ranks.rank + 1}-of-{ranks.count}" if ranks.count > 1 else ""
-        Task.__init__(self, settings, printer, record=target.record)
+    def __init__(
+        self,
+        settings: HologramSettings,
+        printer: Printer,
+        bands: Bands,
+        *,
+        inputs: Mapping[str, np.ndarray],
+        record: TargetRecord | None = None,
+    ):
+        only(settings, LIGHT)
+        self.bands, self.ranks, self.total = bands, bands.ranks, bands.ranks.total
+        Task.__init__(self, settings, printer, record=record)
         self.counted = None
-        own = np.ascontiguousarray(target.pixels[rows.start : rows.stop])
+        rows = bands.rows()
+        own = np.ascontiguousarray(inputs["target"][rows.start : rows.stop])
         self.target = torch.from_numpy(own).to(printer.device)
-        self.notes = [_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"]
+        self.notes = [
+            _LEFT_OUT,
+            f"{bands.count} bands of {bands.band_px} rows, {self.ranks.count} process(es)",
+        ]
+
+    def check_printer(self, printer: Printer) -> None:
+        """Refuse a printer whose reach is not finite, or too wide for the bands."""
+        require_reach(printer)
+        self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
         """The bands are included, because they decide the rounding of sums and so the layout."""
@@ -89,60 +107,49 @@ class BandedHologram(HologramTask):
         """The bench from the element to the own rows of the image plane."""
         return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
 
-    def search_print(self, level: Tensor, printer: int) -> Tensor:
+    def printed(self, level: Tensor, printer: Printer) -> Tensor:
         """Height of the own rows, µm."""
-        return print_bands(level[0, 0], self.printers[printer], self.bands)
+        halo = printer.halo_px
+        around = F.pad(self.bands.with_halo(level[0, 0], halo), (halo, halo))
+        return printer.print_in_tiles(around[None, None], self.bands.band_px)[0, 0]
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of the whole element and its parts, from the own levels (1, 1, rows, size)."""
         loss, parts = super().objective(level)
-        return self.bands.ranks.shared_loss(loss), parts
+        # Every process has the whole loss, but the gradient must count it once.
+        return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
-    def printed_um(self, level: Tensor, printer: int = 0) -> Tensor:
-        """Height of the own rows, µm."""
-        return print_bands(level.float(), self.printers[printer], self.bands)
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Any:
+        """Figures of a print (size, size), µm, of an element in one process."""
+        figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
+        wave = element_field(height_um, self.bench.grid, self.settings.optics)
+        return Figures(**figures, zero_order_share=zero_order_share(wave))
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
         """Write the arrays that all processes share; only the first process gets the hashes."""
-        seen = self.bench(height_um)
-        arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: seen}
-        self.saved = folder
+        arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
-    def findings(self, level: Tensor, height_um: Tensor) -> Findings:
+    def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
         """Figures of the whole element, from disk."""
         levels, seen, aim = (
-            np.load(self.saved / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
+            np.load(folder / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )
         layout = self.settings.layout
         return Findings(
-            printability=printability(levels, layout),
             out_of_distribution=out_of_distribution(levels, layout, self.printer.card),
             predicted=image_figures(seen, aim, Bands(layout.size_px, self.bands.band_px)),
         )
 
-    def finished_iterations(self, folder: Path) -> int:
-        """Iterations that all processes have finished.
+    def display(self, seen: np.ndarray) -> np.ndarray:
+        """The image over its brightest value, reduced to 1,024 px a side at most."""
+        import cv2
 
-        Raises:
-            InputError: the processes differ in their iterations, or their number has changed.
-        """
-        done, ranks = super().finished_iterations(folder), self.bands.ranks
-        others = list(folder.glob("checkpoint*.pt"))
-        if float(ranks.total(torch.tensor([float(done)]))) != done * ranks.count or (others and not done):
-            raise InputError(
-                f"checkpoints in {folder}",
-                got="checkpoints of another number of processes, or of different iterations",
-                wanted=f"one of the same iteration from each of {ranks.count}",
-                hint="start as many processes as before, or delete them to start again",
-            )
-        return done
-
-    def together(self, value: bool) -> bool:
-        """Whether ``value`` holds for any process; waits for all of them."""
-        return bool(self.bands.ranks.total(torch.tensor([float(value)])) > 0)
+        side = min(len(seen), _PREVIEW_PX)
+        small = cv2.resize(seen, (side, side), interpolation=cv2.INTER_AREA)
+        return small / small.max()
 
 
 class BandedBench(nn.Module):

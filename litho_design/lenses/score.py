@@ -47,8 +47,8 @@ class LensScore(Record):
 class ImagingScore(Record):
     """Means and standard deviations over test objects and noise seeds that the design never used.
 
-    ``design`` deconvolves with the PSF that the design expected, ``calibrated`` with the PSF of the
-    print itself; ``direct`` is the sensor image without deconvolution, at the scale of least error.
+    ``design`` deconvolves with the PSF that the design expected, ``calibrated`` with the PSF of the print
+    itself; ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
     """
 
     mae_direct: float = Field(description="test objects: MAE of the sensor image, best scale")

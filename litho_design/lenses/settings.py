@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from pydantic import model_validator
 
@@ -35,6 +35,8 @@ class LensView(Record):
     searches with a strip through the centre and the ring propagator instead of the whole plane; it
     needs a circular aperture and a ring layout, and scores always use the plane.
     """
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})
 
     aperture: Literal["square", "circle"] = setting("circle", "Aperture of the lens")
     window_px: int = setting(254, "Lens: side of the PSF window", unit="px", option="--window-px", ge=16)

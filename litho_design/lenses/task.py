@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -95,11 +95,6 @@ class LensTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
-        self.strips = (
-            [strip_rings(settings.layout, p.strip_halo_px, self.cells.cells[0]) for p in self.printers]
-            if self.radial
-            else []
-        )
         self.notes += [_PLANE_NOTE] if rings and placed else []
         self.notes += _narrow_window(self.bench)
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
@@ -117,9 +112,9 @@ class LensTask(Task):
             raise InputError("search path 'radial'", got="a thick element", wanted="a thin one", hint=hint)
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
-    def search_print(self, level: Tensor, printer: int) -> Tensor:
+    def search_print(self, level: Tensor, printer: Printer) -> Tensor:
         """Height of the rings (rings,) or of the plane (size, size), µm."""
-        return self.printed_rings(level, printer) if self.radial else super().search_print(level, printer)
+        return self.printed_rings(level, printer) if self.radial else self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
         """Area of the rings."""
@@ -155,15 +150,14 @@ class LensTask(Task):
         """The root of the PSF over its peak."""
         return np.sqrt(seen / seen.max())
 
-    def printed_rings(self, level: Tensor, printer: int = 0) -> Tensor:
-        """Height (rings,), µm, inside the aperture, from one printer's print of a strip along a radius.
+    def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
+        """Height (rings,), µm, inside the aperture, from a print of a strip along a radius.
 
         The strip continues the rings beyond the aperture, as the layout's corners do.
         """
-        rings = self.cells.average(level[0, 0])
-        press = self.printers[printer]
-        strip = rings[self.strips[printer]][None, None]
-        return press.print_patch(strip, press.strip_halo_px)[0, 0].mean(0)
+        rings, halo = self.cells.average(level[0, 0]), printer.strip_halo_px
+        strip = rings[strip_rings(self.settings.layout, halo, len(rings))][None, None]
+        return printer.print_patch(strip, halo)[0, 0].mean(0)
 
     @cached_property
     def _ideal_peak(self) -> float:
@@ -217,6 +211,7 @@ def _narrow_window(bench: LensBench) -> list[str]:
     ]
 
 
+@lru_cache(maxsize=8)
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
     """Ring of each pixel of a strip: two central rows, rings 0 to the aperture, a halo all round.
 
@@ -242,10 +237,6 @@ def _check(settings: LensSettings) -> None:
         raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
     if optics.propagation == "far-field":
         raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
-    window = settings.window
-    if radial and window.samples and window.stitch.sigma_um:
-        got, hint = "displaced write fields", "--set view.path=plane"
-        raise InputError("search path 'radial'", got=got, wanted="a spread of rings", hint=hint)
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")
     if settings.task == "direct":

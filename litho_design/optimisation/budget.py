@@ -18,27 +18,18 @@ _KIB_PER_GIB = 1 << 20
 
 
 class Budget(Record):
-    """Cost of one iteration, measured on a trial iteration that changes nothing.
-
-    ``seconds_after``: time of scores and report after the search.
-    """
+    """Cost of one iteration, measured on a trial iteration that changes nothing."""
 
     seconds_per_iteration: float
     seconds_per_evaluation: float
     peak_memory_gib: float
-    seconds_after: float = 0.0
 
-    def total_seconds(self, search: SearchSettings, done: int = 0) -> float:
-        """Expected time of the search after ``done`` iterations, of its polish, and of scores and report."""
+    def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
+        """The estimate in one line, for the iterations left after ``done``, and for scores and report."""
         left = search.iterations - done
-        evaluations = left / search.evaluate_every
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
-        return searched + evaluations * self.seconds_per_evaluation + self.seconds_after
-
-    def sentence(self, search: SearchSettings, done: int = 0) -> str:
-        """The estimate in one line, for the iterations left after ``done``."""
-        minutes = self.total_seconds(search, done) / 60
-        what = f"{search.iterations - done} more iterations" if done else f"{search.iterations} iterations"
+        minutes = (searched + left / search.evaluate_every * self.seconds_per_evaluation + seconds_after) / 60
+        what = f"{left} more iterations" if done else f"{search.iterations} iterations"
         return (
             f"estimate: {what} of {self.seconds_per_iteration:.2f} s, "
             f"about {minutes:.1f} min with scores and page; peak memory {self.peak_memory_gib:.2f} GiB"

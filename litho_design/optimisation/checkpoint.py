@@ -8,13 +8,14 @@ import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_design.optimisation.ranks import Ranks
 
 # The error that torch raises for a damaged file depends on the position of the damage.
 _DAMAGED = (
@@ -26,13 +27,6 @@ _DAMAGED = (
     TypeError,
     AttributeError,
 )
-
-
-class Stateful(Protocol):
-    """A part of a search with a state of its own: its parameters, its optimiser, its rate."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any: ...
 
 
 @dataclass
@@ -48,7 +42,7 @@ class SearchState:
 
 
 def save_checkpoint(
-    path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Stateful], seconds: float
+    path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Any], seconds: float
 ) -> None:
     """Write the state of a search and of its parts; ``fingerprint`` says which task they belong to."""
     found = vars(state) | {"earlier_seconds": seconds}
@@ -59,7 +53,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    path: Path, fingerprint: str, stateful: Mapping[str, Stateful], device: torch.device
+    path: Path, fingerprint: str, stateful: Mapping[str, Any], device: torch.device
 ) -> SearchState:
     """Load the parts in place from a checkpoint, and return its state on ``device``.
 
@@ -87,10 +81,23 @@ def checkpoint_path(folder: Path, part: str = "") -> Path:
     return folder / f"checkpoint{part}.pt"
 
 
-def finished_iterations(folder: Path, part: str = "") -> int:
-    """Finished iterations of an interrupted run in ``folder``; 0 without one."""
-    path = checkpoint_path(folder, part)
-    return int(_load(path)["found"]["iteration"]) if path.exists() else 0
+def finished_iterations(folder: Path, ranks: Ranks) -> int:
+    """Iterations of an interrupted run in ``folder`` that all its processes have finished; 0 without one.
+
+    Raises:
+        InputError: the processes differ in their iterations, or their number has changed.
+    """
+    path = checkpoint_path(folder, ranks.part)
+    done = int(_load(path)["found"]["iteration"]) if path.exists() else 0
+    alike = float(ranks.total(torch.tensor([float(done)]))) == done * ranks.count
+    if not alike or (not done and any(folder.glob("checkpoint*.pt"))):
+        raise InputError(
+            f"checkpoints in {folder}",
+            got="checkpoints of another number of processes, or of different iterations",
+            wanted=f"one of the same iteration from each of {ranks.count}",
+            hint="start as many processes as before, or delete them to start again",
+        )
+    return done
 
 
 def remove_checkpoint(folder: Path, part: str = "") -> None:

@@ -11,57 +11,26 @@ from litho_data.commands.progress import progress
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import Objective
 
-# Up to this many cells, every single change is tried; with more, the gradient proposes changes.
-_EXHAUSTIVE_CELLS = 64
+# Share of the cells that a round changes at first.
+_FIRST_SHARE = 0.02
 
 
 def polish_levels(
     levels: Tensor, cells: CellMap, objective: Objective, *, level_count: int, rounds: int
 ) -> tuple[Tensor, list[float]]:
-    """Improve an integer layout by changing cells; the loss never rises.
+    """Improve an integer layout by one-level moves of cells; the loss never rises.
 
-    Few cells: every level of every cell is tried in turn until no change helps. Many cells: the
-    gradient at the integer layout ranks one-level moves, the best share of them is applied at once,
-    and the share is halved whenever the true loss of the changed layout does not fall.
+    The gradient at the integer layout ranks the moves, the best share of them is applied at once, and the
+    share is halved whenever the true loss of the changed layout does not fall.
 
     Args:
         levels: int64 (*cells).
-        rounds: evaluations with gradient (many cells), or sweeps (few cells).
+        rounds: evaluations with gradient.
 
     Returns:
         Levels, int64 (*cells), and the loss after each accepted round, starting value first.
     """
-    if levels.numel() <= _EXHAUSTIVE_CELLS:
-        return _coordinate_descent(levels, cells, objective, level_count, rounds)
-    return _gradient_moves(levels, cells, objective, level_count, rounds)
-
-
-@torch.no_grad()
-def _coordinate_descent(
-    levels: Tensor, cells: CellMap, objective: Objective, level_count: int, rounds: int
-) -> tuple[Tensor, list[float]]:
-    best = levels.clone()
-    losses = [_loss(best, cells, objective)]
-    for _ in range(rounds):
-        before = losses[-1]
-        for index in range(best.numel()):
-            trial = best.clone()
-            for level in range(level_count):
-                trial.view(-1)[index] = level
-                loss = _loss(trial, cells, objective)
-                if loss < losses[-1]:
-                    best = trial.clone()
-                    losses.append(loss)
-        if losses[-1] == before:
-            break
-    return best, losses
-
-
-def _gradient_moves(
-    levels: Tensor, cells: CellMap, objective: Objective, level_count: int, rounds: int
-) -> tuple[Tensor, list[float]]:
-    best = levels.clone()
-    share = 0.02
+    best, share = levels.clone(), _FIRST_SHARE
     gain, move, loss = _rank_moves(best, cells, objective, level_count)
     losses = [loss]
     for _ in progress(range(rounds), "polishing", estimate_of=0):
@@ -90,7 +59,3 @@ def _rank_moves(
     move = -slope.sign().long()
     allowed = (levels + move >= 0) & (levels + move < level_count)
     return torch.where(allowed, slope.abs(), 0.0), move, float(loss.detach())
-
-
-def _loss(levels: Tensor, cells: CellMap, objective: Objective) -> float:
-    return float(objective(cells(levels)[None, None].float())[0])

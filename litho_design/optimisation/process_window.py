@@ -1,11 +1,11 @@
-"""Process window: prints and optics that differ from the model, drawn at random."""
+"""Process window: random prints and optics that differ from the model."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.optics import Optics, sampling_limit_um
-from litho_design.optimisation.stitching import Stitching
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,11 +22,8 @@ _NARROWEST_BLUR_PX = 0.2
 # A print passes if no figure in dB falls further below that of the print as modelled, every other figure
 # keeps this share of it, and no error grows by more than the inverse.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
-_UNSEEN_STREAM, _STITCH_STREAM = 1, 3
-_IN_PLACE = Stitching()
-_SPREADS = (
-    "gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um", "stitch.sigma_um"
-)  # fmt: skip
+_UNSEEN_STREAM = 1
+_SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um")
 
 
 class ProcessWindow(Record):
@@ -40,6 +36,8 @@ class ProcessWindow(Record):
     microscope.
     """
 
+    FORMER: ClassVar[frozenset[str]] = frozenset({"risk", "weight", "pass_drop_db", "pass_share", "stitch"})
+
     gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0, le=1)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
     gain_offset_correlation: float = setting(0.0, "Correlation of gain and offset", ge=-1, le=1)
@@ -50,7 +48,6 @@ class ProcessWindow(Record):
     wavelength_sd_um: float = setting(
         0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
     )
-    stitch: Stitching = setting(_IN_PLACE, "Write fields of a print")
     samples: int = setting(
         0,
         "Draws of the process window in the loss; 0 designs for the print as modelled",
@@ -66,10 +63,11 @@ class ProcessWindow(Record):
 
 def spreads(window: ProcessWindow) -> list[str]:
     """Every spread of a window with its value and unit, for reports."""
-    told = []
-    for leaf in (leaf for leaf in leaves(window) if leaf.path in _SPREADS):
-        told.append(f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip())
-    return told
+    return [
+        f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip()
+        for leaf in leaves(window)
+        if leaf.path in _SPREADS
+    ]
 
 
 @dataclass(frozen=True)
@@ -80,23 +78,16 @@ class Draw:
     offset_um: float
     blur_um: float
     optics: Optics
-    stitch: Stitching = _IN_PLACE
-    stitch_seed: tuple[int, ...] = ()
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
         """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
 
         A uniform offset changes no image, only the scores of heights. Rings are blurred along the radius
-        only, which is exact if they are much wider than the blur or far from the centre. For maps only, write
-        fields are then displaced.
+        only, which is exact if they are much wider than the blur or far from the centre.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
-        if sigma_px >= _NARROWEST_BLUR_PX:
-            changed = blurred(changed, sigma_px)
-        if self.stitch.sigma_um:
-            changed = self.stitch.drawn(changed, pitch_um, list(self.stitch_seed))
-        return changed
+        return blurred(changed, sigma_px) if sigma_px >= _NARROWEST_BLUR_PX else changed
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
@@ -116,10 +107,8 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
             optics=optics.at_wavelength(
                 optics.wavelength_um + window.wavelength_sd_um * wavelength
             ).model_copy(update={"distance_um": optics.distance_um + window.defocus_sd_um * defocus}),
-            stitch=window.stitch,
-            stitch_seed=(window.seed, _STITCH_STREAM, int(unseen), number),
         )
-        for number, (gain, offset, blur, defocus, wavelength) in enumerate(normal)
+        for gain, offset, blur, defocus, wavelength in normal
     ]
 
 
@@ -131,28 +120,27 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             or without a positive wavelength.
     """
     drawn = draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
-    nearest_um = min(draw.optics.distance_um for draw in drawn)
-    shortest_um = min(draw.optics.wavelength_um for draw in drawn)
-    if shortest_um <= 0:
+    lengths_um = [draw.optics.wavelength_um for draw in drawn]
+    if min(lengths_um) <= 0:
         raise InputError(
             f"wavelength {optics.wavelength_um:g} µm with a spread of {window.wavelength_sd_um:g} µm",
-            got=f"{shortest_um:.4g} µm in a draw of the process window",
+            got=f"{min(lengths_um):.4g} µm in a draw of the process window",
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
     # The angular spectrum has no limit, but an image plane behind the element must stay behind it.
-    if optics.propagation != "rayleigh-sommerfeld":
-        limit_um = min(draw.optics.wavelength_um for draw in drawn)
+    limit_um = min(lengths_um)
+    if optics.propagation == "rayleigh-sommerfeld":
+        limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
+    nearest_um, wanted = min(draw.optics.distance_um for draw in drawn), f"at least {limit_um:.4g} µm"
     if optics.distance_um < limit_um:
-        got, wanted = f"{optics.distance_um:g} µm", f"at least {limit_um:.4g} µm"
         hint = f"the wavelength is {optics.wavelength_um:g} µm: are nm meant?" if limit_um > 20 else ""
-        raise InputError("propagation distance", got=got, wanted=wanted, hint=hint)
+        raise InputError("propagation distance", got=f"{optics.distance_um:g} µm", wanted=wanted, hint=hint)
     if nearest_um < limit_um:
         raise InputError(
             f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",
             got=f"{nearest_um:.4g} µm in a draw of the process window",
-            wanted=f"at least {limit_um:.4g} µm",
+            wanted=wanted,
             hint="lower --defocus-sd-um",
         )
 
@@ -172,7 +160,8 @@ def measure_yield(
     modelled: Mapping[str, float],
     errors: Collection[str] = (),
 ) -> Yield:
-    """How many drawn prints pass, that is, keep all figures shared with the print as modelled close to it.
+    """The share of drawn prints that pass, because their figures stay close to those of the print as
+    modelled.
 
     Args:
         errors: figures that are better when lower.

@@ -1,4 +1,4 @@
-"""The search loop of every task: free parameters in, printable levels out; it can resume from checkpoints."""
+"""The search loop of every task, from free parameters to printable levels, resumable from checkpoints."""
 
 from __future__ import annotations
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
-
-from pydantic import model_validator
+from typing import Any, ClassVar, Literal, get_args
 
 from litho_data.commands.settings import changed, setting
 from litho_data.foundation.errors import require_known
@@ -25,6 +23,8 @@ StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 class SearchSettings(Record):
     """How the layout is searched; every choice that the paper leaves open is a recorded setting."""
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"start_iterations", "start_jitter_levels", "hard_from"})
 
     parametrisation: Literal["gumbel", "direct"] = setting(
         "direct",
@@ -86,21 +86,17 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """With further models in the search, the loss is their worst loss + weight * disagreement in waves."""
 
+    FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
+
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )
 
 
-# Former settings, which nobody changed, of designs that must stay readable.
-_GONE = (
-    *("search.start_iterations", "search.start_jitter_levels", "search.hard_from", "ensemble.risk"),
-    *("window.risk", "window.weight", "window.pass_drop_db", "window.pass_share", "fabrication.weight"),
-    *("view.centre_um", "camera.pitch_um", "camera.numerical_aperture"),
-)
-
-
 class DesignSettings(Record):
     """The settings that every design has."""
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"camera"})
 
     variant: Variant = setting(
         "default",
@@ -113,20 +109,6 @@ class DesignSettings(Record):
     window: ProcessWindow = setting(ProcessWindow(), "Process window")
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
     fabrication: Fabrication = setting(Fabrication(), "Limits of the printer")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_today(cls, content: Any) -> Any:
-        if not isinstance(content, dict):
-            return content
-        kept: dict[str, Any] = {}
-        for name, part in content.items():
-            left = part
-            if isinstance(part, dict):
-                left = {key: value for key, value in part.items() if f"{name}.{key}" not in _GONE}
-            if left or not part:
-                kept[name] = left
-        return kept
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:

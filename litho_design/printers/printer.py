@@ -115,28 +115,28 @@ class Printer(nn.Module):
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
-    def print_again(self, level: Tensor) -> Tensor:
-        """Like ``print_patch``, but nothing is kept for the gradient, which prints the patch again."""
-        if torch.is_grad_enabled():
-            again: Tensor = checkpoint(self.print_patch, level, use_reentrant=False)
-            return again
-        return self.print_patch(level)
+    def print_in_tiles(self, around: Tensor, tile_px: int) -> Tensor:
+        """Printed height, µm (b, 1, y, x), of levels with the printer's halo on all sides, tile by tile.
 
-    def print_in_tiles(self, level: Tensor, tile_px: int) -> Tensor:
-        """Printed height as by ``forward``, but in tiles with halos, which the gradient computes again.
-
-        Memory grows with ``tile_px`` instead of the element. For models of finite reach the result equals
-        that of ``forward`` up to rounding; for others ``tiling_check`` measures the difference.
+        The gradient prints each tile again, so memory grows with ``tile_px`` instead of the element. For
+        models of finite reach the result equals that of ``forward`` up to rounding; for others
+        ``tiling_check`` measures the difference.
         """
-        halo = self.halo_px
-        around = F.pad(level, (halo,) * 4)
 
-        def tile(top: int, left: int) -> Tensor:
-            bottom, right = (min(start + tile_px, self.layout.size_px) + 2 * halo for start in (top, left))
-            return self.print_again(around[..., top:bottom, left:right])
+        def tiles(length: int) -> list[slice]:
+            border = 2 * self.halo_px
+            ends = range(0, length - border, tile_px)
+            return [slice(at, min(at + tile_px, length - border) + border) for at in ends]
 
-        starts = range(0, self.layout.size_px, tile_px)
-        return torch.cat([torch.cat([tile(top, left) for left in starts], -1) for top in starts], -2)
+        def printed(patch: Tensor) -> Tensor:
+            if not torch.is_grad_enabled():
+                return self.print_patch(patch)
+            again: Tensor = checkpoint(self.print_patch, patch, use_reentrant=False)
+            return again
+
+        rows = [around[..., part, :] for part in tiles(around.shape[-2])]
+        columns = tiles(around.shape[-1])
+        return torch.cat([torch.cat([printed(row[..., part]) for part in columns], -1) for row in rows], -2)
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:

@@ -87,7 +87,8 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Judges from the zoo, trained on the same prints as the first ``known`` model but not among them.
+    """Judges from the zoo that were trained on the same prints as the first ``known`` model, without known
+    models.
 
     A model that was not calibrated for the layout is left out.
     """

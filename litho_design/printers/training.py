@@ -1,4 +1,4 @@
-"""How the levels and steps of a layout compare with those of a model's training layouts."""
+"""Compare the levels and steps of a layout with those of a model's training layouts."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """In words, what ``share`` has much more of than ``trained``; empty if nothing."""
+    """Describe what ``share`` has much more of than ``trained``; empty if nothing."""
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:
         return []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics, centred_grid
+from litho_design.optimisation.descent import descended
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -162,7 +162,9 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Whole levels (size, size): gain * height above the lowest point + zero, within the levels."""
+        """Whole levels (size, size) of gain * (height above the lowest point) + zero, limited to the
+        printable levels.
+        """
         layout = self.settings.layout
         level = gain * (self.target - self.target.amin()) / layout.level_height_um + zero
         return self.cells(self.cells.average(level).round().clamp(0, layout.levels - 1))
@@ -177,30 +179,24 @@ class ReliefTask(Task):
         """None: heights do not depend on the light."""
         return
 
-    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The task's arrays, and the error that remains even with real levels, which no layout avoids."""
+    def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
+        """The task's arrays, and the error that remains even with real levels, a lower limit for layouts."""
         left = self.asked - self._free_print
-        return super().arrays(height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
+        return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
     def _free_print(self) -> Tensor:
         """The print with the lowest loss of levels that need not be whole, µm."""
-        search = self.settings.search
         free = DirectLevels(self.settings.layout).to(self.printer.device)
         free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
-        optimiser = torch.optim.Adam(free.parameters(), lr=search.learning_rate * free.rate_unit)
-        best, lowest = None, math.inf
-        for _ in range(_FREE_ITERATIONS):
-            print_um = self.printer(free.sample())[0, 0]
-            loss = self.loss(print_um)
-            if float(loss.detach()) < lowest:
-                best, lowest = print_um.detach(), float(loss.detach())
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            free.project()
-        assert best is not None
-        return best
+
+        def loss() -> tuple[Tensor, Tensor]:
+            print_um = self.printed(free.sample(), self.printer)
+            return self.loss(print_um), print_um.detach()
+
+        rate = self.settings.search.learning_rate * free.rate_unit
+        steps: Any = {"rate": rate, "iterations": _FREE_ITERATIONS, "project": free.project}
+        return descended(free.parameters(), loss, **steps)[0]
 
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5

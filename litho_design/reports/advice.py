@@ -1,4 +1,4 @@
-"""Advice about a layout before it is printed, in words; used by commands and reports."""
+"""Advice about a layout before it is printed, for commands and reports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
-# Names of figures whose key, spelt out, says too little; the scores' field descriptions explain them.
+# Names of figures whose keys are unclear; the scores' field descriptions explain them.
 WORDS: Words = {
     key: (name, "")
     for key, name in {
@@ -76,7 +76,7 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """What the available models of the printer say about the layout; empty if there is only its own."""
+    """The prediction of the available models of the printer; empty if there is only the design's own."""
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
         return ""
@@ -132,7 +132,7 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """The stroke that the printed levels reach, and what a full wave would need."""
+    """The stroke of the printed levels, and the height of a full wave."""
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
         f"The highest level prints {stroke.stroke_waves:.2f} waves above the lowest (gain "

@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+import torch
 
 from litho_data.reports.page import Page, capitalised
-from litho_data.reports.pictures import new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
-from litho_design.optimisation.process_window import measure_yield
+from litho_design.optimisation.process_window import PASS_DROP_DB, PASS_SHARE, measure_yield, spreads
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
-from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice, width_sentence
-from litho_design.reports.lens import add_lens_curves, decibels
-from litho_design.reports.parts import (
-    BRIGHTEST,
-    add_gauge,
-    add_notes,
-    add_scores,
-    add_yield,
-    identity,
-    level_table,
-    meanings,
-    progress_figure,
+from litho_design.reports.advice import (
+    WORDS,
+    baseline_line,
+    distribution_warning,
+    headline,
+    named,
+    stroke_advice,
+    thickness_warning,
+    width_sentence,
 )
+from litho_design.reports.pictures import (
+    Panel,
+    decibels,
+    lens_curves,
+    panels_figure,
+    progress_figure,
+    yield_figure,
+)
+from litho_design.reports.tables import level_table, meanings, score_table
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design
 from litho_design.tasks.task import Task
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _TITLES = {
     "hoe": "Holographic element",
@@ -43,13 +46,19 @@ _PSF = " The PSF is in decibels below its peak."
 
 def write_design_report(folder: Path, design: Design, task: Task, history: list[dict[str, float]]) -> Path:
     """Write ``report.html`` and its CSV tables from the arrays in ``folder``."""
-    levels, height_um, seen = (np.load(folder / name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE))
+    height_um, seen = (np.load(folder / name) for name in (HEIGHT_FILE, IMAGE_FILE))
+    lens = isinstance(task, LensTask)
+    facts = {
+        "printer": design.printer.name,
+        "printer, SHA-256": design.printer.sha256,
+        "seed": task.settings.search.seed,
+    }
     page = Page(
         _TITLES.get(design.task, design.task),
         f"Designed through the printer model “{design.printer.name}”; "
         "all scores are those of the printable layout.",
         run=design.run,
-        facts=identity(design),
+        facts=facts,
         words=WORDS,
     )
     page.verdict(
@@ -58,13 +67,13 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         "(litho-design score, litho-design compare). " + width_sentence(design)
     )
     if design.baselines:
-        line = baseline_line(design.baselines)
-        page.paragraph(f"{capitalised(line)}.")
+        page.paragraph(f"{capitalised(baseline_line(design.baselines))}.")
     page.figure(
-        _pictures(folder, design, task, levels, height_um, seen),
-        "Rows are y (down), columns x; lengths in µm." + (_PSF if isinstance(task, LensTask) else ""),
+        panels_figure(_panels(folder, design, task, height_um, seen)),
+        "Rows are y (down), columns x; lengths in µm." + _PSF * lens,
     )
-    add_notes(page, design)
+    notes = filter(None, (distribution_warning(design), thickness_warning(design), *design.notes))
+    page.note(*(f"{capitalised(note)}." for note in notes))
     if design.width is not None:
         rows = [
             {"layout": name, "printed by": model, **figures}
@@ -73,12 +82,11 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         ]
         page.table(rows, "The layout and the uncorrected ones, by every model at hand", "width.csv", digits=4)
     page.heading("All scores", folded=True)
-    labels = meanings(task.score_type)
-    if isinstance(task, LensTask):
-        add_lens_curves(page, design, height_um, seen, task.bench)
-    add_scores(page, design, labels)
-    if design.reference_efficiency:
-        _add_reference(page, design, task)
+    if lens:
+        page.figure(
+            lens_curves(height_um, seen, task.bench), "Print along the central row, PSF profile, and MTF."
+        )
+    _add_scores(page, design, task)
     page.heading("Search", folded=True)
     page.figure(progress_figure(history, design), "Loss of the sampled layout and of the printable layout.")
     page.paragraph(
@@ -86,69 +94,100 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish; the last sample had "
         f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.2g})."
     )
-    import torch
-
-    print_um = torch.from_numpy(height_um).to(task.printer.device)
-    window = task.settings.window
-    draws = task.window_scores(print_um, window.yield_draws)
-    shown = [name for name in draws[0] if name in design.predicted]
-    chosen = [name for name in task.headline if name in shown][:2] or shown[:2]
-    figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
-    add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, task.errors), task.errors)
+    _add_yield(page, design, task, torch.from_numpy(height_um).to(task.printer.device))
     page.heading("Printed height of the levels", folded=True)
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
-    add_gauge(page, design)
+    if tiling := design.tiling:
+        page.paragraph(
+            f"Predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with their halo, the "
+            f"print differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
+        )
+    if design.out_of_distribution is not None:
+        distance = design.out_of_distribution.model_dump(exclude={"flagged"})
+        page.table([distance], "Distance from the model's training layouts", "distance.csv", digits=3)
     page.heading("Settings", folded=True)
     page.code(design.model_dump_json(indent=1, include={"settings", "printer", "target"}))
     return page.write(folder)
 
 
-def _add_reference(page: Page, design: Design, task: Task) -> None:
-    reference, lens = design.reference_efficiency or 1.0, isinstance(task, LensTask)
-    reached = design.predicted["focusing_efficiency" if lens else "eff_signal"] / reference
-    what = (
-        f"A perfect lens of this aperture puts {100 * reference:.1f} % within the same radius"
-        if lens
-        else f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal"
-    )
-    page.paragraph(f"{what}; the print reaches {reached:.2f} of that.")
-
-
-def _pictures(
-    folder: Path, design: Design, task: Task, levels: np.ndarray, height_um: np.ndarray, seen: np.ndarray
-) -> Figure:
+def _panels(
+    folder: Path, design: Design, task: Task, height_um: np.ndarray, seen: np.ndarray
+) -> list[list[Panel]]:
     side, window = design.layout.size_um, task.bench.window.size_um[0]
-    panels: list[tuple[str, np.ndarray, str, tuple[float | None, float | None], str, float]] = [
-        ("layout", levels, "viridis", (0, design.layout.levels - 1), "level", side),
-        (f"print predicted by {design.printer.name}", height_um, "viridis", (None, None), "height, µm", side),
+    levels, printed = np.load(folder / LEVELS_FILE), f"print predicted by {design.printer.name}"
+    first = [
+        Panel("layout", levels, side, "level", "viridis", 0, design.layout.levels - 1),
+        Panel(printed, height_um, side, "height, µm", "viridis", None, None),
     ]
     if isinstance(task, LensTask):
-        panels.append(("PSF", decibels(seen), "inferno", (-40, 0), "dB", window))
-    elif isinstance(task, ReliefTask):
+        return [[*first, Panel("PSF", decibels(seen), window, "dB", low=-40, high=0)]]
+    if isinstance(task, ReliefTask):
         error = 1000 * (height_um - task.inputs["relief_um"])
-        rest = 1000 * np.load(folder / UNPRINTABLE_FILE)
         limit = 2 * float(np.std(error)) + 1e-9
-        for title, off in (
-            ("error, offset free", error - error.mean()),
-            ("the part that no layout prints", rest),
-        ):
-            panels.append((title, off, "RdBu_r", (-limit, limit), "nm", side))
-    elif isinstance(task, HologramTask):
-        target = np.load(folder / TARGET_FILE)
-        panels.append(("wanted image", target, "inferno", (0, 1), "intensity", window))
-        scaled, unit = task.display(seen), "intensity, matched scale"
-        panels.append(("behind the predicted print", scaled, "inferno", (0, BRIGHTEST), unit, window))
-    else:
-        shown, unit = task.display(seen), "over the brightest of each"
-        panels.append(("behind the predicted print", shown, "inferno", (0, 1), unit, window))
-    columns = 3 if len(panels) == 3 else 2
-    figure = new_figure(13 if columns == 3 else 11, 4.2 if columns == 3 else 8.6)
-    axes = figure.subplots(len(panels) // columns, columns).ravel()
-    for axis, (title, array, colours, (low, high), unit, extent) in zip(axes, panels, strict=True):
-        picture = axis.imshow(
-            array, cmap=colours, vmin=low, vmax=high, extent=(0, extent, extent, 0), interpolation="nearest"
+        maps = {
+            "error, offset free": error - error.mean(),
+            "the part that no layout can print": 1000 * np.load(folder / UNPRINTABLE_FILE),
+        }
+        return [first, [Panel(*one, side, "nm", "RdBu_r", -limit, limit) for one in maps.items()]]
+    behind = "behind the predicted print", task.display(seen), window
+    if isinstance(task, HologramTask):
+        wanted = Panel("wanted image", np.load(folder / TARGET_FILE), window, "intensity", high=1)
+        return [first, [wanted, Panel(*behind, "intensity, matched scale")]]
+    return [[*first, Panel(*behind, "over the brightest of each", high=1)]]
+
+
+def _add_scores(page: Page, design: Design, task: Task) -> None:
+    """Add the scores of a design and of its baselines on the same grid."""
+    baselines = design.baselines or {}
+    thick = {} if design.thick is None else {"print, thick element": design.thick}
+    page.table(
+        score_table({"print": design.predicted} | thick | baselines, meanings(task.score_type)),
+        "Scores of the printable layout as printed, and of its baselines on the same grid",
+        "scores.csv",
+        digits=4,
+    )
+    ceiling, settings = baselines.get("continuous phase", {}).get("loss"), task.settings
+    if ceiling is not None and not settings.fabrication.inside_weight and not settings.window.samples:
+        page.paragraph(
+            f"The loss of the printed layout is {design.polished_loss:.4f}; a continuous phase on the same "
+            f"cells reaches {ceiling:.4f} ({100 * (design.polished_loss / ceiling - 1):+.1f} % against it)."
         )
-        axis.set(title=title, xlabel="x, µm", ylabel="y, µm")
-        figure.colorbar(picture, ax=axis, label=unit, shrink=0.8)
-    return figure
+    if reference := design.reference_efficiency:
+        lens = isinstance(task, LensTask)
+        reached = design.predicted["focusing_efficiency" if lens else "eff_signal"] / reference
+        what = (
+            f"A perfect lens of this aperture puts {100 * reference:.1f} % within the same radius"
+            if lens
+            else f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal"
+        )
+        page.paragraph(f"{what}; the print reaches {reached:.2f} of that.")
+
+
+def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
+    """Add the yield of random prints and their figures."""
+    window, errors = task.settings.window, task.errors
+    draws = task.window_scores(print_um, window.yield_draws)
+    passed = measure_yield(draws, design.predicted, errors)
+    page.heading("Process window", folded=True)
+    designed = "in the loss" if window.samples else "not in the loss"
+    page.paragraph(
+        f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
+        f"the axis. The search did not use these prints; the process window was {designed}. Standard "
+        f"deviations: {'; '.join(spreads(window))}."
+    )
+    low, high = (round(100 * edge) for edge in passed.ci95)
+    grown = f", an error grows to {100 / PASS_SHARE:.0f} % at most"
+    page.paragraph(
+        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
+        f"is more than {PASS_DROP_DB:g} dB below the print as modelled, every other one keeps "
+        f"{100 * PASS_SHARE:g} % of it{grown * bool(set(errors) & set(passed.figures))}. "
+        f"Judged by {', '.join(map(named, passed.figures))}."
+    )
+    labels = meanings(task.score_type)
+    chosen = [name for name in task.headline if name in passed.figures][:2] or passed.figures[:2]
+    figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
+    page.figure(
+        yield_figure(draws, figures, errors), "Yield curves; the dashed line is the print as modelled."
+    )
+    page.table(draws, "Single draws", "window.csv", digits=3)

@@ -2,40 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from litho_data.reports.page import Page, capitalised
 from litho_design.holograms.bench import HologramScore
-from litho_design.judging.gap import GapResult, PairedDifference, design_folder
-from litho_design.judging.loaded import LoadedDesign, task_named
+from litho_design.judging.gap import GapResult, GapSummary, PairedDifference, design_folder
+from litho_design.judging.loaded import task_named
 from litho_design.lenses.score import ImagingLensScore
-from litho_design.printers.printer import Printer
 from litho_design.reports.advice import WORDS, baseline_line, called, named
-from litho_design.reports.parts import meanings, picture_grid
+from litho_design.reports.pictures import Panel, panels_figure
+from litho_design.reports.tables import meanings
 from litho_design.tasks.design import Design
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # With fewer seeds, an interval over them is missing or meaningless.
 _FEWEST_SEEDS = 3
-# For each arm a design, and the image behind each judge's print.
-_Judged = dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
-def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
-    """Write ``report.html`` and one CSV per table."""
-    what = (
-        f"hologram of “{result.target}”"
-        if result.task == "hoe"
-        else result.task.replace("lens-", "lens, ").replace("-", " ")
-    )
-    shown = task_named(result.task).headline
+def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequence[Panel]]) -> Path:
+    """Write ``report.html`` and one CSV per table; ``pictures``: of the first seed, one row per arm."""
+    lens = result.task.startswith("lens-")
+    what = result.task.replace("lens-", "lens, ").replace("-", " ")
+    what = f"hologram of “{result.target}”" if result.task == "hoe" else what
     page = Page(
         "The design-to-manufacturing gap",
         f"{capitalised(what)}, designed with {_listed(result.arms)}; {result.settings.search.iterations} "
@@ -47,15 +39,12 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         words=WORDS,
     )
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
-    shown = shown or tuple(own.predicted)
+    shown = task_named(result.task).headline or tuple(own.predicted)
     page.verdict(_verdict(result, shown[0]))
-    judged = _judged(folder, result, printers)
     page.figure(
-        _pictures(judged),
+        panels_figure(pictures),
         f"Seed {result.seeds[0]}. Above each image: what it was designed with, and what printed it. "
-        + (
-            "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
-        ),
+        + ("Square root of the PSF over its peak." if lens else "Scaled to match."),
     )
     page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
@@ -63,18 +52,18 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
         "independent result."
     )
-    page.table(_matrix(result, shown[0]), _caption(result.task, shown[0]), f"matrix_{shown[0]}.csv", digits=3)
-    if own.baselines:
-        line = baseline_line(own.baselines)
-        page.paragraph(f"{capitalised(line)}. No printer is involved in these.")
-    page.heading("Further figures", folded=True)
-    for figure in shown[1:]:
+    for figure in shown:
         page.table(_matrix(result, figure), _caption(result.task, figure), f"matrix_{figure}.csv", digits=3)
+        if figure == shown[0]:
+            if own.baselines:
+                line = capitalised(baseline_line(own.baselines))
+                page.paragraph(f"{line}. No printer is involved in these.")
+            page.heading("Further figures", folded=True)
     page.heading("Reports of the designs", folded=True)
     page.links(
         [
             (
-                (design_folder(Path(), arm, seed) / "report.html").as_posix(),
+                f"{design_folder(Path(), arm, seed).as_posix()}/report.html",
                 f"Designed with {arm}, seed {seed}",
             )
             for arm in result.arms
@@ -95,28 +84,32 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     return page.write(folder)
 
 
+def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
+    """Mean and interval of a figure under a judge, by arm."""
+    return {one.arm: one for one in result.summary if (one.judge, one.figure) == (judge, figure)}
+
+
 def _verdict(result: GapResult, figure: str) -> str:
     """The best arm under each judge that is no arm, or else under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
-    sign = -1 if figure in task_named(result.task).errors else 1
+    sign = 1 if figure in task_named(result.task).errors else -1
     unit = " dB" if figure.endswith("_db") else ""
     told = []
     for judge in judges:
-        found = {i.arm: i.judged_mean for i in result.summary if (i.judge, i.figure) == (judge, figure)}
-        ranking = sorted(found, key=lambda arm: -sign * found[arm])
+        found = {arm: one.judged_mean for arm, one in _means(result, figure, judge).items()}
+        best, *others = sorted(found, key=lambda arm: sign * found[arm])
         text = (
-            f"Printed by {called(judge)}, layouts designed with {called(ranking[0])} are best: "
-            f"{found[ranking[0]]:.4g}{unit}"
+            f"Printed by {called(judge)}, layouts designed with {called(best)} are best: "
+            f"{found[best]:.4g}{unit}"
         )
-        if len(ranking) > 1:
+        if others:
             pair = next(
-                i
-                for i in result.paired
-                if (i.judge, i.figure) == (judge, figure) and {i.arm, i.against} == set(ranking[:2])
+                one
+                for one in result.paired
+                if (one.judge, one.figure, {one.arm, one.against}) == (judge, figure, {best, others[0]})
             )
-            text += f", against {found[ranking[1]]:.4g}{unit} with {called(ranking[1])}; " + _chance(
-                pair, len(result.seeds)
-            )
+            text += f", against {found[others[0]]:.4g}{unit} with {called(others[0])}; "
+            text += _chance(pair, len(result.seeds))
         told.append(f"{text}.")
     return f"{' '.join(told)} The figure is the {_label(figure)}."
 
@@ -145,40 +138,9 @@ def _listed(things: Iterable[object]) -> str:
 
 
 def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:
-    rows = []
-    for arm in result.arms:
-        row: dict[str, str] = {"designed with": arm}
-        for item in result.summary:
-            if item.arm == arm and item.figure == figure:
-                interval = "" if item.judged_ci95 is None else " [{:.3f}, {:.3f}]".format(*item.judged_ci95)
-                row[f"printed by {item.judge}"] = f"{item.judged_mean:.3f}{interval}"
-        rows.append(row)
-    return rows
-
-
-def _judged(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> _Judged:
-    """For every arm, the image (or PSF) behind each judge's print, first seed."""
-    images = {}
-    for arm, own in printers.items():
-        if arm not in result.arms:
-            continue
-        loaded = LoadedDesign(design_folder(folder, arm, result.seeds[0]), device=own.device)
-        images[arm] = (
-            loaded,
-            {name: loaded.image(loaded.printed_um(judge)) for name, judge in printers.items()},
-        )
-    return images
-
-
-def _pictures(judged: _Judged) -> Figure:
-    target = next(iter(judged.values()))[0].target
-    wanted = {} if target is None else {"wanted": target.cpu().numpy()}
-    rows = {
-        arm: wanted
-        | {
-            f"{arm}:\n{'in design' if name == arm else f'printed by {name}'}": loaded.display(image)
-            for name, image in by_judge.items()
-        }
-        for arm, (loaded, by_judge) in judged.items()
-    }
-    return picture_grid(rows, next(iter(judged.values()))[0].window_um)
+    rows: dict[str, dict[str, Any]] = {arm: {"designed with": arm} for arm in result.arms}
+    for judge in result.judges:
+        for arm, one in _means(result, figure, judge).items():
+            interval = "" if one.judged_ci95 is None else " [{:.3f}, {:.3f}]".format(*one.judged_ci95)
+            rows[arm][f"printed by {judge}"] = f"{one.judged_mean:.3f}{interval}"
+    return list(rows.values())

@@ -10,7 +10,8 @@ from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import Judgement, ScoreResult
 from litho_design.reports.advice import WORDS, called, headline, spread_sentence
-from litho_design.reports.parts import meanings, picture_grid, score_table
+from litho_design.reports.pictures import Panel, panels_figure
+from litho_design.reports.tables import meanings, score_table
 
 
 def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) -> Path:
@@ -25,13 +26,13 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     )
     page.verdict(_verdict(result))
     page.figure(
-        picture_grid({"": judgement.pictures}, judgement.side_um),
+        panels_figure([[Panel(*shown, judgement.side_um) for shown in judgement.pictures.items()]]),
         "The wanted image, and behind each print the image at matched scale; of a lens the square root of "
         "the PSF.",
     )
     if judgement.photos:
         page.figure(
-            picture_grid({"": judgement.photos}, judgement.frame_um),
+            panels_figure([[Panel(*shown, judgement.frame_um) for shown in judgement.photos.items()]]),
             "Photograph through the printed lens, each image at the scale of least error. The scores are of "
             "this one object.",
         )
@@ -91,7 +92,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """How much worse or better than expected, in the figure that compares holograms."""
+    """The difference from the expectation, in the figure that compares holograms."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

@@ -14,7 +14,7 @@ from litho_data.layouts.patterns import flat, framed_ladder
 from litho_data.layouts.random_layout import random_layout
 from litho_data.reports.page import filled
 from litho_design.exports.files import export
-from litho_design.exports.formats import Format
+from litho_design.exports.job import Format
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.targets import Target
 from litho_design.judging.gap import design_folder

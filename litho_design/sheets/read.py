@@ -1,4 +1,4 @@
-"""From the scans of a sheet to a dataset, a model with its card, a closed loop and a comparison."""
+"""Evaluate the scans of a sheet: a dataset, a model with its card, a closed loop and a comparison."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.run_facts import run_facts
 from litho_data.layouts.card_text import CARD_NAME
 from litho_data.reports.page import Page
+from litho_design.images.measurements import MeasuredSource
 from litho_design.judging.gap import design_folder
-from litho_design.judging.measured import MeasuredSource
 from litho_design.printers.source import Device
 from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, ReadSheet, Sheet
 from litho_design.workflows.score import score
@@ -25,7 +25,7 @@ _BASE = "physics"
 
 
 def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
-    """Turn a sheet's scans into a model of the printer, what it lacks, and the hologram's two images.
+    """Learn a model of the printer from a sheet's scans, find what it lacks, and compare both holograms.
 
     Args:
         sheet: folder of ``new_sheet``, with the scans in it.

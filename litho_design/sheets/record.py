@@ -1,4 +1,4 @@
-"""``sheet.json``, what was handed out, and ``read.json``, what came back."""
+"""The records ``sheet.json`` of a sheet, and ``read.json`` of its evaluation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """What a lab received; ``expected_db``: SI-PSNR of each hologram's image, predicted by ``model``."""
+    """The sheet for a lab; ``expected_db``: SI-PSNR of each hologram's image, predicted by ``model``."""
 
     SCHEMA: ClassVar[str] = "litho-design/sheet/1"
     FILE_NAME: ClassVar[str] = "sheet.json"

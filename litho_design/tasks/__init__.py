@@ -1,1 +1,1 @@
-"""The contract of a task, the run that holograms and lenses share, and the record of a finished design."""
+"""The interface of a task, the run that all tasks share, and the record of a finished design."""

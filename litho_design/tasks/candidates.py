@@ -25,7 +25,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         return searched, None
     figures: dict[str, dict[str, dict[str, float]]] = {}
     for name, level in candidates.items():
-        seen = {model: task.bench(one(level[None, None].float())[0, 0]) for model, one in models.items()}
+        seen = {model: task.bench(task.printed_um(level, one)) for model, one in models.items()}
         figures[name] = {
             model: {"loss": float(task.loss_by(models[model], one)[0]), **task.window_figures(one)}
             for model, one in seen.items()

@@ -18,8 +18,7 @@ from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.budget import peak_memory_gib
-from litho_design.optimisation.disagreement import EnsembleRecord
-from litho_design.printers.layout import LayoutSettings, Printability
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.width import Width
@@ -36,7 +35,7 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device, and duration including interrupted runs."""
+    """Command, software, device and duration of a run, including interrupted runs."""
 
     device: str
     threads: int
@@ -58,11 +57,9 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """What a task finds out about its levels and their print; ``thick``: figures as a thick element."""
+    """Findings of a task about its levels and their print; ``thick``: figures as a thick element."""
 
     tiling: TilingCheck | None = None
-    ensemble: EnsembleRecord | None = None
-    printability: Printability
     out_of_distribution: OutOfDistribution | None = None
     reference_efficiency: float | None = None
     predicted: dict[str, float]
@@ -75,6 +72,7 @@ class Design(Findings, Result):
 
     SCHEMA: ClassVar[str] = "litho-design/design/1"
     FILE_NAME: ClassVar[str] = "design.json"
+    FORMER: ClassVar[frozenset[str]] = frozenset({"ensemble", "printability"})
 
     task: str
     variant: str
@@ -107,24 +105,21 @@ class Design(Findings, Result):
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
-    """Save arrays by file name; returns their SHA-256."""
+    """Save arrays by file name, and levels also as a 16-bit grey PNG; returns their SHA-256."""
     hashes = {}
     for name, array in arrays.items():
         with atomic_file(folder / name) as temporary, open(temporary, "wb") as stream:
             np.save(stream, array, allow_pickle=False)
         hashes[name] = file_sha256(folder / name)
+    if LEVELS_FILE in arrays:
+        import cv2
+
+        picture = folder / Path(LEVELS_FILE).with_suffix(".png")
+        encoded = cv2.imencode(".png", arrays[LEVELS_FILE].astype(np.uint16))[1]
+        with atomic_file(picture) as temporary:
+            temporary.write_bytes(encoded.tobytes())
+        hashes[picture.name] = file_sha256(picture)
     return hashes
-
-
-def write_level_image(folder: Path, levels: np.ndarray) -> dict[str, str]:
-    """The layout as a 16-bit PNG whose grey value is the level."""
-    import cv2
-
-    name = "layout_level.png"
-    encoded = cv2.imencode(".png", levels.astype(np.uint16))[1]
-    with atomic_file(folder / name) as temporary:
-        temporary.write_bytes(encoded.tobytes())
-    return {name: file_sha256(folder / name)}
 
 
 def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:

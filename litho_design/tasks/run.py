@@ -16,8 +16,8 @@ from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
 from litho_design.optics.stroke import measure_stroke
-from litho_design.optimisation.budget import Budget, measure_budget
-from litho_design.optimisation.checkpoint import SearchState, remove_checkpoint
+from litho_design.optimisation.budget import measure_budget
+from litho_design.optimisation.checkpoint import SearchState, finished_iterations, remove_checkpoint
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.search import search_layout
 from litho_design.tasks.candidates import best_layout
@@ -59,11 +59,11 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
     }
     # The first of the processes that share a design keeps the folder.
-    with growing_folder(folder, Design.FILE_NAME, facts) if task.leads else nullcontext() as begun:
-        if not task.together(begun is not None and begun.finished):
-            _make(task, folder, facts, before, report if task.reported else None, announce and task.leads)
-            task.together(True)
-            remove_checkpoint(folder, task.part)
+    with growing_folder(folder, Design.FILE_NAME, facts) if task.ranks.rank == 0 else nullcontext() as begun:
+        if not task.ranks.any(begun is not None and begun.finished):
+            _make(task, folder, facts, before, report, announce and task.ranks.rank == 0)
+            task.ranks.wait()
+            remove_checkpoint(folder, task.ranks.part)
     return Design.read(folder)
 
 
@@ -72,7 +72,7 @@ def _make(
     folder: Path,
     facts: Mapping[str, Any],
     weights_sha256: Sequence[str],
-    report: Report | None,
+    report: Report,
     announce: bool,
 ) -> None:
     """Search, choose, print, score and write."""
@@ -82,9 +82,9 @@ def _make(
     with ExitStack() as precisions:
         for printer in task.printers:
             precisions.enter_context(printer.at_precision(settings.search.precision))
-        found, state, budget, seconds = _search(task, folder, record_sha256(facts), announce)
+        found = _searched(task, folder, record_sha256(facts), announce)
     level, width, loss = task.cells(found.levels), None, found.loss
-    if task.polished:
+    if task.in_one_piece:
         level, width = best_layout(task, level)
     if width is not None and width.returned != SEARCHED:
         what = f"the models at hand print the layout “{width.returned}” better than the searched one"
@@ -92,75 +92,75 @@ def _make(
         with torch.no_grad():
             loss = float(task.objective(level[None, None].float())[0])
     height = task.printed_um(level)
-    for printer, then in zip(task.printers, weights_sha256, strict=True):
-        if printer.weights_sha256() != then:
-            raise InputError(
-                f"model {printer.name}",
-                got="weights or buffers that changed during the run",
-                wanted="a model that printing does not change",
-            )
+    if [printer.weights_sha256() for printer in task.printers] != weights_sha256:
+        raise InputError(
+            f"model {', '.join(printer.name for printer in task.printers)}",
+            got="weights or buffers that changed during the run",
+            wanted="a model that printing does not change",
+        )
     files = task.save(folder, level, height)
-    if not task.leads:
+    if task.ranks.rank:
         return
     design = Design(
         **facts,
         task=task.name,
         variant=settings.variant,
-        run=RunRecord.of(height.device, seconds, budget.seconds_per_iteration),
+        run=RunRecord.of(height.device, found.seconds, found.seconds_per_iteration),
         layout=layout,
         optics=settings.optics,
         printer=task.printer.record(),
         stroke=measure_stroke(heights, wave_um, level_height_um=layout.level_height_um),
         notes=task.notes,
-        iterations=state.iteration,
+        iterations=found.state.iteration,
         start_loss=found.start_loss,
-        sample_loss=state.history[-1]["sample_loss"],
-        argmax_loss=state.best_loss,
+        sample_loss=found.state.history[-1]["sample_loss"],
+        argmax_loss=found.state.best_loss,
         polished_loss=loss,
         files=files,
         width=width,
-        **dict(task.findings(level, height)),
+        **dict(task.findings(folder, level, height)),
     )
-    if report is not None:
-        report(folder, design, task, state.history)
+    if task.in_one_piece:
+        report(folder, design, task, found.state.history)
     design.write(folder)
 
 
-class _Found(NamedTuple):
+class _Searched(NamedTuple):
+    """Levels per cell after search and polish with their loss, the search itself, and its costs."""
+
     levels: Tensor
-    start_loss: float
     loss: float
+    start_loss: float
+    state: SearchState
+    seconds: float
+    seconds_per_iteration: float
 
 
-def _search(
-    task: Task, folder: Path, fingerprint: str, announce: bool
-) -> tuple[_Found, SearchState, Budget, float]:
-    """Levels per cell after search and polish; the search, the cost of an iteration, and total seconds."""
+def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Searched:
     search, started = task.settings.search, time.monotonic()
-    done = task.finished_iterations(folder)
+    done = finished_iterations(folder, task.ranks)
     parameters = task.free_parameters()
+    first = parameters.cells(parameters.best_levels())
     with torch.no_grad():
-        start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
+        start_loss = float(task.objective(first[None, None].float())[0])
     budget = measure_budget(parameters, task.objective, search)
     if announce:
-        if task.reported:
-            after = _seconds_after(task, parameters.cells(parameters.best_levels()))
-            budget = budget.model_copy(update={"seconds_after": after})
-        for line in (*task.notes, budget.sentence(search, done)):
+        after = _seconds_after(task, first) if task.in_one_piece else 0.0
+        for line in (*task.notes, budget.sentence(search, done, after)):
             say(line)
     state = search_layout(
-        parameters, task.objective, search, folder=folder, fingerprint=fingerprint, part=task.part
+        parameters, task.objective, search, folder=folder, fingerprint=fingerprint, part=task.ranks.part
     )
     assert state.best_levels is not None
     levels, loss = state.best_levels, state.best_loss
-    if search.polish_rounds and task.polished:
+    if search.polish_rounds and task.in_one_piece:
         levels, losses = polish_levels(
             levels, parameters.cells, task.objective,
             level_count=task.settings.layout.levels, rounds=search.polish_rounds,
         )  # fmt: skip
         loss = losses[-1]
     seconds = state.earlier_seconds + time.monotonic() - started
-    return _Found(levels, start_loss, loss), state, budget, seconds
+    return _Searched(levels, loss, start_loss, state, seconds, budget.seconds_per_iteration)
 
 
 @torch.no_grad()
@@ -168,7 +168,7 @@ def _seconds_after(task: Task, level: Tensor) -> float:
     """Time of choice, scores and yield, from one print by each model and one draw of the yield."""
     models = (*task.printers, *task.judges)
     started = time.perf_counter()
-    heights = [one(level[None, None].float())[0, 0] for one in models]
+    heights = [task.printed_um(level, one) for one in models]
     printed = time.perf_counter()
     task.window_scores(heights[0], 1)
     per_score = time.perf_counter() - printed

@@ -1,4 +1,4 @@
-"""A task: what light should do behind a printed element. Holograms and lenses are tasks; write your own."""
+"""The interface of a task: what light should do behind a printed element."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
-from litho_design.optimisation.checkpoint import finished_iterations
-from litho_design.optimisation.disagreement import disagreement_um, measure_disagreement
-from litho_design.optimisation.fabrication import fabrication_penalty
+from litho_design.optimisation.disagreement import disagreement_um
+from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.parameters import CellMap, Parametrisation, make_parametrisation
 from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.process_window import Draw, check_draws, draws, risk
+from litho_design.optimisation.ranks import ALONE
 from litho_design.optimisation.settings import DesignSettings
-from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.bench import ViewsBench
@@ -35,7 +34,6 @@ from litho_design.tasks.design import (
     LEVELS_FILE,
     Findings,
     write_arrays,
-    write_level_image,
 )
 
 
@@ -57,9 +55,8 @@ class Task:
         starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
         headline: figures that reports and commands show first; if empty, all.
         errors: figures that are better when lower; ``loss_unit``: see ``Width``.
-        polished, reported: whether the search ends with single-level changes, and the run with a page.
-        part, leads: if several processes share the task: the name of its checkpoint, and whether it writes
-            the record.
+        in_one_piece: whether the search ends with single-level changes, and the run with a page.
+        ranks: the processes that share the task.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
         settings, printer, printers, inputs: as given; ``notes``: notes for the record.
         bench: from a height map to what is seen, in the optics of the settings.
@@ -83,8 +80,8 @@ class Task:
     loss_unit: ClassVar[float | None] = None
     score_type: ClassVar[type[Record]] = Figures
     settings_type: ClassVar[type[DesignSettings]] = DesignSettings
-    polished = reported = leads = True
-    part = ""
+    in_one_piece = True
+    ranks = ALONE
 
     def __init__(
         self,
@@ -105,6 +102,8 @@ class Task:
         self.notes: list[str] = []
         # Models of the printer that the search does not use.
         self.judges: Sequence[Printer] = ()
+        for one in self.printers:
+            self.check_printer(one)
         self.cells = self.make_cells().to(printer.device)
         self.bench: Any = self.make_bench(settings.optics)
         for optics in self.views(settings.optics):
@@ -155,22 +154,24 @@ class Task:
         phase = printed_phase(nominal, self.settings.optics).to(self.printer.device)
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
+    def check_printer(self, printer: Printer) -> None:
+        """Refuse a printer that cannot print this task's layouts."""
+
     def search_bench(self, optics: Optics) -> Any:
         """The bench of the search, from ``search_print`` to what the loss sees."""
         return self.make_bench(optics)
 
-    def search_print(self, level: Tensor, printer: int) -> Tensor:
-        """Printed height of levels (1, 1, size, size), µm, by one of the printers, for the search."""
-        return self.printers[printer](level)[0, 0]
+    def search_print(self, level: Tensor, printer: Printer) -> Tensor:
+        """Printed height of levels (1, 1, size, size), µm, for the search."""
+        return self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
         """Area that each height of ``search_print`` covers; None for pixels."""
         return None
 
-    @torch.no_grad()
-    def printed_um(self, level: Tensor, printer: int = 0) -> Tensor:
-        """Printed height of levels on the pixels, µm, which the design keeps."""
-        return self.printers[printer](level[None, None].float())[0, 0]
+    def printed(self, level: Tensor, printer: Printer) -> Tensor:
+        """Printed height (size, size), µm, of real levels (1, 1, size, size); gradients flow to them."""
+        return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
         """Score of a print (size, size), µm, whose design expected ``expected_um``, by default the same."""
@@ -190,29 +191,16 @@ class Task:
         """Figures of one draw of the process window."""
         return self.figures(seen)
 
-    def finished_iterations(self, folder: Path) -> int:
-        """Finished iterations of an interrupted run in ``folder``."""
-        return finished_iterations(folder, self.part)
-
-    def together(self, value: bool) -> bool:
-        """Whether ``value`` holds for any of the processes that share the search; waits for all of them."""
-        return value
-
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
         """Write levels, print and what is seen; SHA-256 by file name."""
-        levels = level.cpu().numpy().astype(np.uint8)
-        arrays = {LEVELS_FILE: levels, HEIGHT_FILE: height_um.cpu().numpy(), **self.arrays(height_um)}
-        return write_arrays(folder, arrays) | write_level_image(folder, levels)
+        return write_arrays(folder, self.arrays(level, height_um))
 
-    def findings(self, level: Tensor, height_um: Tensor) -> Findings:
-        """What the record of a design says about its levels and their print."""
-        settings, layout = self.settings, self.settings.layout
-        whole, levels = level[None, None].float(), level.cpu().numpy().astype(np.uint8)
+    def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
+        """Findings for the record about levels and their print; ``folder`` contains the arrays."""
+        layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(
-            tiling=self.printer.tiling_check(whole),
-            ensemble=measure_disagreement(self.printers, whole, settings.optics.wave_height_um),
-            printability=printability(levels, layout),
+            tiling=self.printer.tiling_check(level[None, None].float()),
             out_of_distribution=out_of_distribution(levels, layout, self.printer.card),
             reference_efficiency=self.reference_efficiency(height_um),
             predicted=self.score(height_um).model_dump(),
@@ -220,23 +208,25 @@ class Task:
             thick=None if thick is None else thick.model_dump(),
         )
 
-    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Arrays saved beside levels and heights, by file name: what is seen, and the inputs."""
+    def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
+        """The arrays of a design by file name: levels, heights, what is seen, and the inputs."""
         with torch.no_grad():
             seen = self.bench(height_um).cpu().numpy()
-        return {IMAGE_FILE: seen} | {f"{name}.npy": array for name, array in self.inputs.items()}
+        levels = level.cpu().numpy().astype(np.uint8)
+        made = {LEVELS_FILE: levels, HEIGHT_FILE: height_um.cpu().numpy(), IMAGE_FILE: seen}
+        return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
         """Efficiency of an ideal element found from a print (size, size), µm; None if that is undefined."""
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores on the same grid to compare a design's with; by default those of a flat plate."""
+        """Baseline scores on the same grid, by default those of a flat plate."""
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """What is seen, as reports show it: images over their brightest value, side by side in a square."""
+        """What is seen, for reports: images divided by their brightest value, side by side in a square."""
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
         tiles = np.zeros((side * side, *images.shape[1:]))
@@ -250,7 +240,9 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Draws of the process window in the loss with their benches; the print as modelled without draws."""
+        """Draws of the process window in the loss, with their benches; without draws, the print as
+        modelled.
+        """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
         return [(draw, self.search_bench(draw.optics)) for draw in drawn] or [
@@ -272,10 +264,10 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models, it is their worst loss plus their disagreement; with samples of the process
-        window, the risk over them; then the penalties for the limits of the printer are added.
+        With several models it is their worst loss plus their disagreement; with samples of the process window
+        it is the risk over them. The penalty on rare levels and steps is added.
         """
-        settings, prints = self.settings, [self.search_print(level, n) for n in range(len(self.printers))]
+        settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
         parts: dict[str, float] = {}
         for draw, bench in self.scenes:
@@ -293,8 +285,14 @@ class Task:
         if len(prints) > 1 and settings.ensemble.weight:
             apart_um = disagreement_um(torch.stack(prints), self.search_area())
             loss = loss + settings.ensemble.weight * apart_um / settings.optics.wave_height_um
-        extra = fabrication_penalty(level, settings.fabrication, settings.layout, self.printer.card)
-        return loss if extra is None else loss + extra, parts
+        if weight := settings.fabrication.inside_weight:
+            loss = loss + weight * outside(level, settings.layout.levels, self.printer.card)
+        return loss, parts
+
+    @torch.no_grad()
+    def printed_um(self, level: Tensor, printer: Printer | None = None) -> Tensor:
+        """Printed height, µm, of whole levels (size, size), by default through the first printer."""
+        return self.printed(level[None, None].float(), printer or self.printer)
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:

@@ -1,4 +1,4 @@
-"""The width of a design: its layout and the uncorrected ones as every available model prints them."""
+"""The width of a design: figures of its layout and of uncorrected layouts by every available model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Design with every arm and print with every judge: the design-to-manufacturing gap in one folder."""
+"""Measure the design-to-manufacturing gap: design with every arm and print with every judge."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
+from litho_design.reports.pictures import Panel
 from litho_design.tasks.design import DESIGNS, Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
@@ -118,11 +119,11 @@ def compare(
     with growing_folder(folder, GapResult.FILE_NAME, holds=DESIGNS):
         done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
         designs = [design for _, design in progress(done, "designs", len(jobs))]
-        entries = [
-            entry
+        judged = {
+            (arm, seed): _judged(design_folder(folder, arm, seed), arm, seed, everyone)
             for arm, seed in itertools.product(designers, every_seed)
-            for entry in _judged(design_folder(folder, arm, seed), arm, seed, everyone)
-        ]
+        }
+        entries = [entry for found, _ in judged.values() for entry in found]
         shown = task_named(designs[0].task).headline
         result = GapResult(
             task=designs[0].task,
@@ -136,7 +137,7 @@ def compare(
             summary=summarise(entries),
             paired=paired_differences(entries, shown or tuple(designs[0].predicted)),
         )
-        write_gap_report(folder, result, everyone)
+        write_gap_report(folder, result, [judged[arm, every_seed[0]][1] for arm in designers])
         result.write(folder)
     return result
 
@@ -149,12 +150,14 @@ def _design(job: _Job) -> Design:
     return run_design(make(settings, printer), place, write_design_report, announce=announce)
 
 
-def _judged(place: Path, arm: str, seed: int, printers: Mapping[str, Printer]) -> list[GapEntry]:
-    """Entries for one finished design, as printed by every printer."""
-    own = printers[arm]
-    loaded = load_design(place, device=own.device)
-    expected = loaded.printed_um(own)
-    entries = []
+def _judged(
+    place: Path, arm: str, seed: int, printers: Mapping[str, Printer]
+) -> tuple[list[GapEntry], list[Panel]]:
+    """A finished design as printed by every printer: entries, and pictures after the wanted one."""
+    loaded = load_design(place, device=printers[arm].device)
+    expected = loaded.printed_um(printers[arm])
+    entries, side_um = [], loaded.window_um
+    panels = [] if loaded.target is None else [Panel("wanted", loaded.target.cpu().numpy(), side_um)]
     for name, printer in printers.items():
         printed = loaded.printed_um(printer)
         entries.append(
@@ -168,7 +171,9 @@ def _judged(place: Path, arm: str, seed: int, printers: Mapping[str, Printer]) -
                 rms_height_gap_um=float((printed - expected).square().mean().sqrt()),
             )
         )
-    return entries
+        title = f"{arm}:\n{'in design' if name == arm else f'printed by {name}'}"
+        panels.append(Panel(title, loaded.display(loaded.image(printed)), side_um))
+    return entries, panels
 
 
 def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Sequence[int]) -> None:

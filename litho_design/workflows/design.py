@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
+from litho_design.images.measurements import MeasuredSource
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.loaded import load_design
-from litho_design.judging.measured import MeasuredSource, measured_print
-from litho_design.large.bands import Bands, Ranks
-from litho_design.large.hologram import BandedHologram
+from litho_design.judging.measured import measured_print
+from litho_design.large.bands import Bands
+from litho_design.large.hologram import HOLOGRAM, SEARCH, BandedHologram, only
 from litho_design.large.lens import RingLens
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import lens_task
+from litho_design.optimisation.ranks import Ranks
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -35,18 +37,34 @@ from litho_design.tasks.task import Task, registered_task
 S = TypeVar("S", bound=DesignSettings)
 
 
+class How(TypedDict, total=False):
+    """What every design takes.
+
+    Attributes:
+        judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
+            by default the zoo's models that were trained on the same prints.
+        robust: search also through those judges that have gradients: for the lowest worst loss, plus a
+            penalty on the models' disagreement.
+        device: device of the models.
+        extrapolate: accept heights beyond a model's calibration; recorded in the result.
+        announce: print the expected time and memory to stderr before starting (the default).
+    """
+
+    judges: Iterable[str | Printer] | None
+    robust: bool
+    device: Device
+    extrapolate: bool
+    announce: bool
+
+
 def design_hologram(
     target: str | Path | np.ndarray | Target,
     model: str | Path | Printer,
     out: str | Path,
     *,
     settings: HologramSettings | None = None,
-    judges: Iterable[str | Printer] | None = None,
-    robust: bool = False,
     band_px: int | None = None,
-    device: Device = "cpu",
-    extrapolate: bool = False,
-    announce: bool = True,
+    **how: Unpack[How],
 ) -> Design:
     """Optimise the layout of a hologram so that its print shows the wanted image.
 
@@ -55,16 +73,10 @@ def design_hologram(
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
-            by default the zoo's models that were trained on the same prints.
-        robust: search also through those judges that have gradients: for the lowest worst loss, plus a
-            penalty on the models' disagreement.
         band_px: most rows of a band; designs in bands, for elements beyond the memory of a process. Processes
             started by torchrun share the bands; with ``cuda`` each takes a GPU of its own. The model must
             have a finite reach, and no judges print the layout.
-        device: device of the models.
-        extrapolate: accept heights beyond a model's calibration; recorded in the result.
-        announce: print the expected time and memory to stderr before starting.
+        how: judges, robust, device, extrapolate, announce (see ``How``).
 
     Returns:
         The record written to ``out/design.json``.
@@ -75,18 +87,19 @@ def design_hologram(
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
     if band_px is not None:
-        judges, ranks = _alone((), judges, robust), Ranks.joined()
+        only(made, SEARCH | HOLOGRAM)
+        ranks = Ranks.joined()
         bands = Bands(made.layout.size_px, band_px, ranks, made.layout.cell_px)
-        device = ranks.device(device)
+        how = _alone(how) | {"device": ranks.device(how.get("device", "cpu"))}
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         wanted = load_target(target, made.layout.size_px)
+        given: Any = {"inputs": {"target": wanted.pixels}, "record": wanted.record}
         if band_px is not None:
-            return BandedHologram(made, printer, wanted, bands)
-        inputs = {"target": wanted.pixels}
-        return HologramTask(made, printer, inputs=inputs, ensemble=others, record=wanted.record)
+            return BandedHologram(made, printer, bands, **given)
+        return HologramTask(made, printer, ensemble=others, **given)
 
-    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
+    return _designed(task, made.layout, model, out, **how)
 
 
 def design_lens(
@@ -96,12 +109,8 @@ def design_lens(
     settings: LensSettings | None = None,
     objects: Sequence[str | Path] = (),
     held_out_objects: Sequence[str | Path] = (),
-    judges: Iterable[str | Printer] | None = None,
-    robust: bool = False,
     tile_px: int | None = None,
-    device: Device = "cpu",
-    extrapolate: bool = False,
-    announce: bool = True,
+    **how: Unpack[How],
 ) -> Design:
     """Optimise the layout of a lens so that its print focuses, or images after reconstruction.
 
@@ -113,7 +122,7 @@ def design_lens(
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
         tile_px: for a lens that focuses light: design its rings along a radius, in tiles of this length,
             without computing the plane, up to 10 mm and more. The model must have a finite reach.
-        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        how: see ``How``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -124,7 +133,8 @@ def design_lens(
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
     if tile_px is not None:
-        judges = _alone((*objects, *held_out_objects), judges, robust)
+        only(made, SEARCH)
+        how = _alone(how, *objects, *held_out_objects)
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         if tile_px is not None:
@@ -132,7 +142,7 @@ def design_lens(
         imaging, inputs = with_objects(made, objects, held_out_objects)
         return lens_task(imaging, printer, inputs=inputs, ensemble=others)
 
-    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
+    return _designed(task, made.layout, model, out, **how)
 
 
 def correct(
@@ -143,11 +153,7 @@ def correct(
     settings: ReliefSettings | None = None,
     after: str | Path | None = None,
     scan: MeasuredSource | None = None,
-    judges: Iterable[str | Printer] | None = None,
-    robust: bool = True,
-    device: Device = "cpu",
-    extrapolate: bool = False,
-    announce: bool = True,
+    **how: Unpack[How],
 ) -> Design:
     """Optimise the layout whose print comes closest to a wanted height map.
 
@@ -158,7 +164,7 @@ def correct(
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction whose print was measured; ``scan``: that measurement. The
             deviation of that print from its expectation is expected again.
-        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        how: see ``How``; robust by default.
 
     Returns:
         The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
@@ -175,7 +181,8 @@ def correct(
         inputs = {"relief_um": heights} | _print_off(made, after, scan)
         return ReliefTask(made, printer, inputs=inputs, ensemble=others, record=record)
 
-    return _designed(task, made.layout, out, announce, model, judges, robust, device, extrapolate)
+    robustly: How = {"robust": True, **how}
+    return _designed(task, made.layout, model, out, **robustly)
 
 
 def _print_off(
@@ -204,11 +211,7 @@ def design(
     *,
     settings: DesignSettings | None = None,
     inputs: Mapping[str, np.ndarray] | None = None,
-    judges: Iterable[str | Printer] | None = None,
-    robust: bool = False,
-    device: Device = "cpu",
-    extrapolate: bool = False,
-    announce: bool = True,
+    **how: Unpack[How],
 ) -> Design:
     """Optimise the layout for a task of your own (see ``Task``).
 
@@ -218,7 +221,7 @@ def design(
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search, process window; ``design_settings()`` by default.
         inputs: arrays that the task needs, by name.
-        judges, robust, device, extrapolate, announce: as for ``design_hologram``.
+        how: see ``How``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -236,40 +239,40 @@ def design(
     def of_task(printer: Printer, others: list[Printer]) -> Task:
         return task(made, printer, inputs=inputs, ensemble=others)
 
-    return _designed(of_task, made.layout, out, announce, model, judges, robust, device, extrapolate)
+    return _designed(of_task, made.layout, model, out, **how)
 
 
 def _designed(
     make: Callable[[Printer, list[Printer]], Task],
     layout: LayoutSettings,
-    out: str | Path,
-    announce: bool,
     model: str | Path | Printer,
-    judges: Iterable[str | Printer] | None,
-    robust: bool,
-    device: Device,
-    extrapolate: bool,
+    out: str | Path,
+    *,
+    judges: Iterable[str | Printer] | None = None,
+    robust: bool = False,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+    announce: bool = True,
 ) -> Design:
     """The design of a task; printers are loaded first, to refuse bad ones before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
-    rivals = (
-        models_at_hand([printer.record()], layout, device=device)
-        if judges is None
-        else list(load_printers(judges, layout, **fit).values())
-    )
+    if judges is None:
+        rivals = models_at_hand([printer.record()], layout, device=device)
+    else:
+        rivals = list(load_printers(judges, layout, **fit).values())
     in_search = [one for one in rivals if robust and not one.only_judges]
     task = make(printer, in_search)
     task.judges = [one for one in rivals if one not in in_search]
     return run_design(task, out, write_design_report, announce=announce)
 
 
-def _alone(objects: Iterable[Any], judges: Iterable[Any] | None, robust: bool) -> tuple[()]:
-    """Refuse objects, judges and ``robust`` for a large element; returns no judges."""
-    if robust or tuple(objects) or judges:
+def _alone(how: How, *objects: Any) -> How:
+    """Refuse objects, judges and ``robust`` for a large element; returns the rest, without judges."""
+    if how.get("robust") or objects or how.get("judges"):
         got = "objects or judges"
         raise InputError("large element", got=got, wanted="one design through one model")
-    return ()
+    return {**how, "judges": ()}
 
 
 def _of_kind(settings: S, kind: type[S]) -> S:

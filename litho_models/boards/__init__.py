@@ -1,1 +1,1 @@
-"""Boards: stores made by the virtual fab with hidden causes, and the judge of what a loop says about them."""
+"""Boards: stores of the virtual fab with hidden causes, and the judge of a loop's answers."""

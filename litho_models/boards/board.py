@@ -1,4 +1,4 @@
-"""A board that any loop can enter: stores with hidden causes, a record of what they hide, and the judge."""
+"""A board that any loop can enter: stores, a record of their hidden causes, and the judge."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
-# On singles every printer is a Physics model; mixtures have others too, so there the best base is chosen.
+# The printers of singles are all Physics models. Mixtures have others too, so the best base is chosen.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
-# Maps a dataset store and an empty working folder to what the loop says.
+# Maps a dataset store and an empty working folder to the loop's answer.
 Loop = Callable[[Path, Path], Answer]
 
 
 class Judged(Result):
-    """Which board and loop a folder of judged trials belongs to."""
+    """The board and loop that a folder of judged trials belongs to."""
 
     SCHEMA: ClassVar[str] = "litho-models/board-judged/1"
     FILE_NAME: ClassVar[str] = "judged.json"
@@ -45,12 +45,12 @@ class Judged(Result):
 
 
 def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
-    """The draws of a board.
+    """Draw the trials of a board.
 
     Raises:
         InputError: settings that cannot be drawn, or fields that cannot be printed.
     """
-    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed before a trial fails on them
+    Plan(n_scans, (size_px, size_px))  # Refuses impossible fields before a trial fails on them.
     trials = draw_board(board, seed)
     return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
 
@@ -64,19 +64,20 @@ def new_board(
     n_scans: int = 12,
     size_px: int = 256,
 ) -> Draws:
-    """Make the stores of a board in ``out/stores`` and write what they hide to ``out/hidden``; resumable.
+    """Make the stores of a board in ``out/stores`` and their answers in ``out/hidden``; resumable.
 
     Args:
         out: folder of the board.
-        board: one cause per trial, or two to four; ``seed``: decides everything that is drawn.
-        trials: make only the first so many of the drawn trials (in random order); None: all.
+        board: ``singles`` (one cause per trial) or ``mixtures`` (two to four); ``seed``: determines all
+            draws.
+        trials: number of drawn trials to make, from the first; None: all.
         n_scans: scans in each store; ``size_px``: side of a layout.
 
     Raises:
         InputError: settings that cannot be drawn, or a folder with another board.
     """
     drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
-    # A trial in measured prints needs a store of measured prints, which this board does not have.
+    # Trials in measured prints are left out, because they need a store of measured prints.
     kept = [draw for draw in drawn.trials if draw.kind != "measured"][:trials]
     draws = drawn.model_copy(update={"trials": kept})
     facts = draws.model_dump(mode="json", exclude={"schema_"})
@@ -107,12 +108,12 @@ def judge_board(
 ) -> Scoreboard:
     """Give every store of a board to a loop, judge its answers, and write ``scoreboard.json`` and its table.
 
-    An error inside the loop only fails that trial. An interrupted run resumes.
+    An error inside the loop fails only that trial. Interrupted runs resume.
 
     Args:
         board: folder of ``new_board``.
         out: folder of the trials; each keeps what the loop wrote.
-        loop: function of a store and an empty folder; by default the closed loop of this package.
+        loop: function of a store and an empty folder that returns an answer; by default our closed loop.
         name: name of the loop; an ``out`` with the trials of another loop is refused.
         report: gets the progress messages of the default loop.
 
@@ -145,11 +146,12 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """Wrap a command as a loop: its last arguments are STORE and FOLDER, and it writes FOLDER/answer.json.
+    """Wrap a command as a loop. The command gets STORE and FOLDER as last arguments and writes
+    FOLDER/answer.json.
 
     Raises:
-        InputError: a command that cannot be run; from the loop, a command that exits with a code other
-            than 0 or writes no answer.
+        InputError: a command that cannot be run. The loop raises it for a non-zero exit code or a missing
+            answer.
     """
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
@@ -187,13 +189,13 @@ def store_of(board: Path, draw: Draw) -> Path:
 
 
 def cpu_s() -> float:
-    """Processor seconds of this process and of the children it has waited for."""
+    """Processor seconds of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def trial_line(trial: Trial) -> str:
-    """A trial in one line: what became of each cause, false names, error, and why it failed."""
+    """Describe a trial in one line: outcome of each cause, false names, error, reason of a failure."""
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false: {name}" for name in trial.false_names]
     ratio = trial.errors and trial.errors.ratio

@@ -1,7 +1,7 @@
-"""Draw what is planted from all that the virtual fab can do, with one seed, before anything is run.
+"""Draw the planted causes from everything that the virtual fab can do, with one seed, before any run.
 
-Two boards: ``singles``, one cause per trial, and ``mixtures``, two to four at once. Nothing here reads the
-loop's catalogue of effects.
+There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. This module
+does not read the loop's catalogue of effects.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# A size set on four scans may be 13 % smaller on all scans: even then the drawn causes have to count.
+# Smallest drawn size. A size set on four scans may be 13 % smaller on all scans, and must still count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
-# Numbers of mixtures with a linear slope loss by batch, with an S-shaped axis in half of the scans, with
-# another cause whose strength differs by batch or field, and with a printer beyond the Physics model.
+# Numbers of mixtures with these features: a linear slope loss by batch, an S-shaped axis in half of the
+# scans, another cause whose strength differs by batch or field, a printer beyond the Physics model.
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
-# The default noise contains the first, so every trial has it; a refit leaves less than 10 nm of the second.
+# Not drawn: the first is part of the default noise; a refit leaves less than 10 nm of the second.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# Drawn anew in every scan, or no change of the height map: no model of all scans can contain them.
+# New in every scan, or no change of the height map, so no model of all scans can contain them.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -37,11 +37,11 @@ _OF_SINGLE_SCANS = {
     "slow-drift",
     "periodic-lines",
 }
-# The measured prints have these already, or may have: finding them would prove nothing.
+# The measured prints may already have these, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
-# Knobs newer than the first boards; without them those boards are drawn as before.
+# Knobs added after the first boards, left out there to keep their draws.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
-# Ranges of the printers' parameters: within the Physics model and its bounds, but not the fab's defaults.
+# Ranges of the printers' parameters, around the fab's defaults and within the bounds of Physics.
 _PRINTER_RANGES = {
     "threshold_dose": (0.2, 0.4),
     "threshold_steepness": (1.2, 3.0),
@@ -52,11 +52,10 @@ _PRINTER_RANGES = {
 
 
 def draw_board(board: Board, seed: int) -> list[Draw]:
-    """The trials of a board, in random order, each with a printer of its own.
+    """Draw the trials of a board, in random order, each with its own printer.
 
-    Knobs and forms are dealt like cards: none comes twice before all have come once. Knobs ``in-form`` are
-    those that the base cannot imitate; an ``alias`` is one that it can, or that the scans' own terms absorb.
-    Sizes are log-uniform.
+    Knobs and forms are dealt like cards: each is used once before any is used again. An ``alias`` is a knob
+    that the base can imitate or that scan terms absorb; other knobs are ``in-form``. Sizes are log-uniform.
 
     Raises:
         InputError: a negative seed.
@@ -110,7 +109,7 @@ def _draw_singles(rng: np.random.Generator) -> list[Draw]:
 
 
 def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
-    """Draw about as many causes in form as of another form; no two in a trial share a right name."""
+    """Draw about as many causes in form as of another form. No two in a trial share a right name."""
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
     deck = chain.from_iterable(zip(in_form, other, strict=False))
@@ -145,7 +144,7 @@ def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
 
 
 def _in_groups(cause: CauseDraw, at: int, rng: np.random.Generator) -> CauseDraw:
-    """Let the first causes of a mixtures board differ in strength by batch or by field."""
+    """Make the strength of the first causes of a mixtures board differ by batch or by field."""
     if at < LINEAR:
         return _by_batch(cause, rng)
     if at < LINEAR + S_SHAPED:
@@ -164,13 +163,13 @@ def _draw_printer(rng: np.random.Generator) -> dict[str, float]:
 
 
 def _by_batch(cause: CauseDraw, rng: np.random.Generator) -> CauseDraw:
-    """The cause, made weaker after a place in the middle of the printing order."""
+    """Make a cause weaker after a point near the middle of the printing order."""
     place, weak = f"{rng.uniform(-0.2, 0.2):.3f}", round(rng.uniform(0.0, 0.6), 3)
     return cause.model_copy(update={"by": "batch", "place": place, "weak": weak})
 
 
 def _by_field(cause: CauseDraw, rng: np.random.Generator, weak: float | None = None) -> CauseDraw:
-    """The cause, made weaker in two of the four fields of each print."""
+    """Make a cause weaker in two of the four fields of each print."""
     place = "".join(sorted(rng.permutation(list("1234"))[:2]))
     weak = round(rng.uniform(0.0, 0.6), 3) if weak is None else weak
     return cause.model_copy(update={"by": "field", "place": place, "weak": weak})
@@ -183,7 +182,7 @@ def _deal(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Deal from a deck until there are ``size``; skip those with a right name that is refused or taken."""
+    """Deal from a deck until there are ``size`` causes; skip those whose right names are refused or taken."""
     names = list(started)
     while len(names) < size:
         name = next(deck)

@@ -1,4 +1,4 @@
-"""The scoreboard: all draws with their outcomes, and the few figures that count."""
+"""The scoreboard: all draws with their outcomes, and headline figures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
 
-# Largest accepted error after the loop, as a multiple of the true models' error.
+# Largest accepted error with the findings, as a multiple of the true models' error.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -22,7 +22,7 @@ _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
 
 
 class Figure(NamedTuple):
-    """A headline figure in words, and its target, set before the board was run; empty without a target."""
+    """A headline figure in words, with the target set before the board was run; empty without a target."""
 
     what: str
     value: str
@@ -30,7 +30,7 @@ class Figure(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """A planted cause that counts: its trial, its name, and what became of it."""
+    """A planted cause that counts: its trial, its name and its outcome."""
 
     trial: Trial
     name: str
@@ -38,7 +38,7 @@ class Counted(NamedTuple):
 
 
 def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scoreboard:
-    """The scoreboard of a board from its finished trials; ``command`` makes it again."""
+    """Make the scoreboard of a board from its finished trials; ``command`` reproduces it."""
     run = run_info([draws.seed], draws.n_scans)
     done = {trial.draw.number for trial in trials}
     return Scoreboard(
@@ -53,7 +53,7 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """How many of how many, with the exact 95 % interval (Clopper and Pearson)."""
+    """Hits and total, with the exact 95 % interval (Clopper and Pearson)."""
     known = [*hits]
     if not known:
         return "none of 0"
@@ -62,7 +62,7 @@ def share(hits: Iterable[bool]) -> str:
 
 
 def counted(trials: Iterable[Trial]) -> list[Counted]:
-    """Causes above 8 nm; in a trial that failed before they were sized, those drawn above 8 nm."""
+    """Causes above 8 nm; if a trial failed before sizing, causes drawn above 8 nm."""
     found = []
     for trial in trials:
         sizes = {one.name: one.wanted_rms_nm for one in trial.draw.causes}
@@ -76,7 +76,7 @@ def counted(trials: Iterable[Trial]) -> list[Counted]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """The headline figures; in a failed trial no cause counts as found, and its error counts as too large."""
+    """The headline figures. In a failed trial no cause counts as found, and the error counts as too large."""
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
     empty = [
@@ -113,13 +113,13 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Whether the mean absolute error after the loop is within the tolerance; False if it is unknown."""
+    """Whether the error with the findings is within the tolerance; False if unknown."""
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= tolerance(trial)
 
 
 def tolerance(trial: Trial) -> float:
-    """Largest accepted error after the loop, as a multiple of the true models' error."""
+    """Largest accepted error with the findings, as a multiple of the true models' error."""
     return TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 
 

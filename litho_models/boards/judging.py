@@ -1,6 +1,6 @@
-"""The judge: compare what a loop says with what was planted, and its error with that of the true models.
+"""Compare a loop's answer with the planted causes, and its error with that of the true models.
 
-The rules are written down in docs/blind_trials.md, before a board is run.
+docs/blind_trials.md states the rules before a board is run.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# For these forms the name of a family is right only with this exponent.
+# For these forms the name is right only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
-# This form consists of line offsets: a loop that reports those has noticed it.
+# This form consists of line offsets, so a loop that reports line offsets has noticed it.
 _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Leave out what the fab's default noise puts into every scan: datum, bow, line offsets and the like."""
+    """Leave out findings that the fab's default noise causes in every scan, such as datum, bow or line
+    offsets.
+    """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
 
@@ -39,9 +41,9 @@ def judged(
     """Judge one trial.
 
     Args:
-        draw: the trial as drawn; ``planted``: what was planted, as `plant` returns it.
-        answer: what the loop says; ``used_s``: processor seconds that it took.
-        jobs: the fields that were printed; ``store``: what the loop was given.
+        draw: the trial as drawn; ``planted``: result of `plant`.
+        answer: the loop's answer; ``used_s``: processor seconds that it took.
+        jobs: the printed fields; ``store``: the store that the loop got.
     """
     locked = set(store.locked_ids)
     scans = [scan for scan in store.scans() if scan.id not in locked]
@@ -68,9 +70,9 @@ def judge(
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """One outcome per planted cause, in order; one for the whole trial if nothing was planted.
+    """Return one outcome per planted cause, in order, or one for the whole trial if nothing was planted.
 
-    Each thing that the loop reports counts for one cause at most; larger causes come first.
+    Each finding counts for at most one cause; larger causes come first.
     """
     found = answer.found
     left = answer.left or bool(_beyond_noise(found))
@@ -101,7 +103,7 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Sets of causes that the loop named although nothing in them was planted, the base's form included."""
+    """Named sets of causes that contain nothing planted, where the base's form also counts as planted."""
     return [
         " | ".join(named.names)
         for named in _beyond_noise(answer.found)
@@ -110,7 +112,7 @@ def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
 
 
 def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
-    """What was planted, without the base's form."""
+    """The planted causes, without the base's form."""
     return [one for one in planted if one.draw in draw.causes]
 
 
@@ -135,8 +137,8 @@ def _displacement_is_shared(
     return False
 
 
-# What no model of all scans can predict: values drawn anew in every scan (or line), rounding, and scars at
-# random places. A bend stays in, because the store's transform of the scan contains it.
+# No model of all scans can predict these: values drawn anew in every scan (or line), rounding, and scars at
+# random positions. Bends stay in, because the store's transform contains them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -153,10 +155,10 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Mean absolute error of the noise-free scans with every cause in place, k = 1, nm.
+    """Mean absolute error of the noise-free scans with all causes, k = 1, nm.
 
-    They are brought onto the layout by the transform (and bend) that the store has for each scan, and
-    scored as the loop scores its models: same scans, same pixels, same terms per scan.
+    The store's transform (and bend) of each scan maps it onto the layout. Scans, pixels and terms per scan
+    are those of the loop's scores.
     """
     by_id = {job.id: job for job in jobs}
     predictions = []
@@ -180,9 +182,9 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Median relative error of the base's values, fitted alone and together with all that was found.
+    """Median relative error of the base's values, without and with the findings.
 
-    None if printer or base is no Physics model.
+    None if printer or base is not a Physics model.
     """
     if draw.base or draw.kind == "measured" or not answer.base_values:
         return None
@@ -190,7 +192,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # The sd of the squared spot, where the base fits it.
+    # The sd of the squared spot, if the base fits it.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:
@@ -200,9 +202,9 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 
 
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
-    """The result of a trial that ended with an error; the error is also printed.
+    """Make the result of a trial that ended with an error, and print the error.
 
-    Results are published, so paths on this machine are replaced by names.
+    Paths are replaced by names, because results are published.
     """
     traceback.print_exception(error)
     reason = f"{type(error).__name__}: {error}"
@@ -212,7 +214,7 @@ def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping
 
 
 def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
-    """The result of a trial that did not finish."""
+    """Make the result of a trial that did not finish."""
     names = [one.name for one in draw.causes] or ["none"]
     return Trial(
         draw=draw,

@@ -1,7 +1,7 @@
-"""Causes whose form is not in the catalogue: other laws, axes, reaches, scales; and bases beyond Physics.
+"""Causes whose form is not in the catalogue (other laws, axes, ranges, scales), and printers beyond Physics.
 
-They use the virtual fab alone: neither this module nor the drawing reads the loop's catalogue of effects. The
-seed of a trial decides what is random in its forms (a direction, a distance, a place).
+Neither this module nor the drawing reads the loop's catalogue of effects. The seed of a trial determines
+random values of its forms, such as a direction, a distance or a position.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _MOST_SCANS = 256
 
 @dataclass(frozen=True)
 class Form:
-    """One form; ``draw`` fixes what is random in it and returns its law.
+    """One form; ``draw`` fixes its random values and returns its law.
 
     Attributes:
         limit: largest strength, in ``unit``; at strength 0 a law changes nothing.
-        meaning: what a strength of one unit does, and what is drawn.
-        deck: boards that deal it; ``base`` belongs to the printer of a mixture and is not dealt.
-        names: names in the catalogue that are right for it; most forms have none.
+        meaning: the meaning of a strength of one unit, and the drawn values.
+        deck: boards that deal it; ``base``: part of a mixture's printer, not dealt.
+        names: right names in the catalogue; most forms have none.
     """
 
     name: str
@@ -56,7 +56,7 @@ FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """Forms at their strengths, as the fab applies them, one after the other at each stage."""
+    """Several forms with strengths, which the fab applies in turn at each stage."""
 
     def __init__(self, strengths: Mapping[str, float], seed: int):
         self._laws = [
@@ -88,7 +88,7 @@ def _number(name: str) -> int:
 def _form(
     name: str, stage: Stage, unit: str, limit: float, deck: Deck = "both", names: tuple[str, ...] = ()
 ) -> Callable[[Draw], Draw]:
-    """Register a drawing function as a form; its docstring says what the form does."""
+    """Register a drawing function as a form, with its docstring as meaning."""
 
     def enter(draw: Draw) -> Draw:
         meaning = " ".join((draw.__doc__ or "").split())
@@ -98,12 +98,12 @@ def _form(
     return enter
 
 
-# Exposure: other reaches and axes
+# Exposure: other ranges and axes
 
 
 @_form("far-copy", "dose", "1", 0.6)
 def _far_copy(rng: np.random.Generator) -> Law:
-    """Dose of a copy that is displaced by 6–15 µm in a drawn direction."""
+    """Relative dose of a copy displaced by 6–15 µm in a random direction."""
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -119,7 +119,7 @@ def _far_copy(rng: np.random.Generator) -> Law:
 
 @_form("oriented-ringing", "dose", "1", 2.0)
 def _oriented_ringing(rng: np.random.Generator) -> Law:
-    """Relative gain at one period (2–5 µm) along one direction; it rings over 2–5 µm."""
+    """Relative gain at one period (2–5 µm) along one direction, ringing over 2–5 µm."""
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -136,7 +136,7 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
 
 @_form("oriented-proximity", "dose", "1", 1.0)
 def _oriented_proximity(rng: np.random.Generator) -> Law:
-    """Dose spread far along one direction only, 4–8 µm, relative to the focused dose."""
+    """Dose spread over 4–8 µm along one direction, relative to the focused dose."""
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: _spread(
         dose, strength, np.exp(-2 * (np.pi * reach_um * _frequency_along(canvas, direction)) ** 2)
@@ -145,7 +145,7 @@ def _oriented_proximity(rng: np.random.Generator) -> Law:
 
 @_form("halo-ring", "dose", "1", 1.0)
 def _halo_ring(rng: np.random.Generator) -> Law:
-    """Dose thrown onto a ring of 4–9 µm radius, relative to the focused dose."""
+    """Dose on a ring of 4–9 µm radius, relative to the focused dose."""
     radius_um = rng.uniform(4, 9)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -157,7 +157,7 @@ def _halo_ring(rng: np.random.Generator) -> Law:
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
 def _fast_axis_memory(rng: np.random.Generator) -> Law:
-    """Share of the dose lost to what the same hatch line wrote before; it fades over 3–8 µm."""
+    """Share of the dose lost after earlier writing in the hatch line; fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -169,7 +169,7 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: np.random.Generator) -> Law:
-    """Relative gain of the dose at full density, as the cube of the density over 2.5–5 µm."""
+    """Relative gain of the dose with the cube of the density over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
@@ -178,7 +178,7 @@ def _crowding(rng: np.random.Generator) -> Law:
 
 @_form("alternate-slices", "dose", "1", 2.0)
 def _alternate_slices(rng: np.random.Generator) -> Law:
-    """Slices that every second level has too many or too few; the sign is drawn."""
+    """Slices too many or too few in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -190,7 +190,7 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: np.random.Generator) -> Law:
-    """Sd added to the spot from one print on, drawn from the middle of the printing order."""
+    """Sd added to the spot from a random print near the middle on."""
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
         blur(dose, canvas.pitch_um, strength) if job.order > first else dose
@@ -202,7 +202,7 @@ def _focus_step(rng: np.random.Generator) -> Law:
 
 @_form("cubic-slope-loss", "surface", "µm", 8.0, names=("slope-thinning",))
 def _cubic_slope_loss(rng: np.random.Generator) -> Law:
-    """Height lost per cubed slope, whichever way it faces."""
+    """Height lost per cubed slope in any direction."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.hypot(*np.gradient(surface, canvas.pitch_um)) ** 3
     )
@@ -210,16 +210,17 @@ def _cubic_slope_loss(rng: np.random.Generator) -> Law:
 
 @_form("diagonal-slope-loss", "surface", "µm", 4.0, names=("slope-thinning",))
 def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
-    """Height lost per squared slope along a direction at 30–60° to the axes."""
+    """Height lost per squared slope along one direction, 30–60° from the axes."""
     direction = rng.uniform(np.pi / 6, np.pi / 3) + rng.integers(2) * np.pi / 2
     return lambda surface, strength, canvas, job: (
         surface - strength * _slope_along(surface, canvas, direction) ** 2
     )
 
 
-@_form("lee-side-loss", "surface", "µm", 2.0)
+@_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: np.random.Generator) -> Law:
-    """Height lost per slope on the flanks that fall in one direction; other flanks lose nothing."""
+    """Height lost per slope, only on flanks that fall in one direction."""
+    # This is half a loss on both flanks and half a displacement, which registration removes.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -228,7 +229,7 @@ def _lee_side_loss(rng: np.random.Generator) -> Law:
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: np.random.Generator) -> Law:
-    """Share of the height lost between two heights 0.15–0.25 µm apart; at 1 they become one plateau."""
+    """Share of the height lost between two heights 0.15–0.25 µm apart; 1: a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
         surface - strength * np.clip(surface - lower_um, 0.0, width_um)
@@ -237,7 +238,7 @@ def _plateau(rng: np.random.Generator) -> Law:
 
 @_form("fringes", "surface", "nm", 150.0)
 def _fringes(rng: np.random.Generator) -> Law:
-    """Amplitude of an error that is periodic in the height, with a period of 0.12–0.3 µm."""
+    """Amplitude of an error periodic in the height, with period 0.12–0.3 µm."""
     period_um, phase = rng.uniform(0.12, 0.3), rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + 1e-3 * strength * np.sin(2 * np.pi * surface / period_um + phase)
@@ -246,7 +247,7 @@ def _fringes(rng: np.random.Generator) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: np.random.Generator) -> Law:
-    """Gain of all detail finer than 0.6–1.2 µm: edges overshoot on both sides."""
+    """Gain of detail finer than 0.6–1.2 µm, so edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
@@ -255,7 +256,7 @@ def _overshoot(rng: np.random.Generator) -> Law:
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
 def _blur_with_height(rng: np.random.Generator) -> Law:
-    """Share of a blurred surface (0.5–1 µm) in the print, growing with the height."""
+    """Share of a surface blurred by 0.5–1 µm, growing with the height."""
     reach_um = rng.uniform(0.5, 1)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -265,12 +266,12 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
     return law
 
 
-# Place: jumps and gradients over the field
+# Position: jumps and gradients over the field
 
 
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: np.random.Generator) -> Law:
-    """Share of a blurred surface (0.7–1.2 µm) at one side of the field, falling to 0 at the other."""
+    """Share of a surface blurred by 0.7–1.2 µm at one side of the field, 0 at the other."""
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -283,21 +284,21 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
 
 @_form("seam-in-gain", "surface", "1", 0.6)
 def _seam_in_gain(rng: np.random.Generator) -> Law:
-    """Share of the height lost on one side of a seam in the middle of the field."""
+    """Share of the height lost on one side of a seam through the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
     return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, side, place))
 
 
 @_form("seam-in-height", "surface", "nm", 300.0)
 def _seam_in_height(rng: np.random.Generator) -> Law:
-    """Step of the height at a seam in the middle of the field."""
+    """Step of the height at a seam through the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
     return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, side, place)
 
 
 @_form("seam-in-place", "surface", "µm", 1.5)
 def _seam_in_place(rng: np.random.Generator) -> Law:
-    """Displacement along a seam of everything on one side of it."""
+    """Displacement of one side of a seam along the seam."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -311,7 +312,7 @@ def _seam_in_place(rng: np.random.Generator) -> Law:
 
 @_form("rim", "surface", "1", 1.0)
 def _rim(rng: np.random.Generator) -> Law:
-    """Relative gain of the height at the edge of the layout; fades inwards over 1.5–3 µm."""
+    """Relative gain of the height at the layout's edge, fading over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
@@ -327,7 +328,7 @@ def _rim(rng: np.random.Generator) -> Law:
 
 @_form("periodic-lines", "scan", "nm", 150.0)
 def _periodic_lines(rng: np.random.Generator) -> Law:
-    """Amplitude of line offsets with a period of 6–20 lines; the phase is new in every scan."""
+    """Amplitude of line offsets of period 6–20 lines; each scan has a new phase."""
     period, phases = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, _MOST_SCANS)
 
     def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
@@ -337,12 +338,12 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
     return law
 
 
-# As on the measured prints; in every mixtures board
+# Known from the measured prints; part of every mixtures board
 
 
 @_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
 def _linear_slope_loss(rng: np.random.Generator) -> Law:
-    """Height lost per slope along the hatch lines, whichever way it faces."""
+    """Height lost per absolute slope along the hatch lines."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.abs(_slope_along(surface, canvas, direction=0.0))
     )
@@ -350,7 +351,7 @@ def _linear_slope_loss(rng: np.random.Generator) -> Law:
 
 @_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
 def _s_shaped_axis(rng: np.random.Generator) -> Law:
-    """Displacement of the scan along x, quadratic and cubic in x; their shares are drawn."""
+    """Displacement along x, quadratic and cubic in x with random shares."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
     def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
@@ -368,7 +369,7 @@ def _s_shaped_axis(rng: np.random.Generator) -> Law:
 
 @_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
 def _two_part_spot(rng: np.random.Generator) -> Law:
-    """Share of the spot in a second part, 0.5–0.9 µm wide (sd)."""
+    """Share of the spot in a second part with sd 0.5–0.9 µm."""
     width_um = rng.uniform(0.5, 0.9)
     return lambda dose, strength, canvas, job: (
         (1 - strength) * dose + strength * blur(dose, canvas.pitch_um, width_um)
@@ -379,15 +380,15 @@ def _two_part_spot(rng: np.random.Generator) -> Law:
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
 def _hill_response(rng: np.random.Generator) -> Law:
-    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) in the response; the rest is logistic."""
+    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) beside the logistic one."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        # Doses at which the default printer's logistic converts what the Hill curve converts at ``dose``.
+        # Doses at which the default printer's logistic gives the Hill curve's conversion at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
-        # Where doses add up the curve may exceed full conversion, which a logistic never reaches.
+        # The sum of doses may exceed full conversion on the Hill curve, which a logistic never reaches.
         response = np.minimum(low + (high - low) * hill, 0.99)
         return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
 
@@ -404,7 +405,7 @@ def _elliptical_blur(rng: np.random.Generator) -> Law:
 
 
 def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:
-    """Mean of the dose and, weighted by ``strength``, the dose spread by a transfer function (1 at f = 0)."""
+    """Mix the dose with the dose spread by a transfer function (1 at f = 0), with weight ``strength``."""
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
@@ -419,12 +420,12 @@ def _slope_along(surface: np.ndarray, canvas: Canvas, direction: float) -> np.nd
 
 
 def _across(canvas: Canvas, axis: int) -> np.ndarray:
-    """Position on the layout along an axis (0: y, 1: x), from 0 at its first edge to 1 at its last."""
+    """Position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the last."""
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> np.ndarray:
-    """True on one side of a seam; ``side`` says which axis it crosses, and on which side it is True."""
+    """True on one side of a seam; ``side`` gives the axis that it crosses, and the side."""
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

@@ -1,4 +1,4 @@
-"""The closed loop of this package as an entry of a board."""
+"""Our closed loop as an entry of a board."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from litho_models.loop.run import close_loop
 def own_loop(
     store: Path, folder: Path, *, base: str, report: Callable[[str], None] = lambda message: None
 ) -> Answer:
-    """Close the loop on a store, with its results in ``folder/loop``; ``base``: the model to correct."""
+    """Run our closed loop on a store, with results in ``folder/loop``; ``base``: the model to correct."""
     return answer_of(close_loop(store, folder / "loop", base=base, report=report))
 
 
 def answer_of(result: CloseLoop) -> Answer:
-    """The result of a closed loop as the answer that a board expects."""
+    """Convert the result of our closed loop to a board's answer."""
     added = [
         Found(
             names=[one.name, *one.confusable_with],

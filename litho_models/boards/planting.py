@@ -1,8 +1,8 @@
-"""What a trial prints: its base parameters and fields, and what is planted at which strength.
+"""Plant the causes of a trial at their strengths, and print its fields.
 
-The size of a cause is what the best refitted base cannot absorb. The Physics model, which contains the plain
-fab, is fitted to the noise-free scans with the cause; each scan may add datum, gain, tilt, bow and an affine
-error of its registration. The rms of what is left is the size.
+The size of a cause is the rms that the best refitted base cannot absorb. The Physics model, which contains
+the plain fab, is fitted to the noise-free scans with the cause. Datum, gain, tilt, bow and an affine
+registration error are free in each scan.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# A strength is searched on four scans (both cut-offs, spread over the order); its size is measured on all.
+# The search for a strength uses four scans (both cut-offs, spread over the order); its size uses all.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
 
 def printer_of(draw: Draw) -> Printer:
-    """The printer of a trial: the default one with the drawn parameters."""
+    """The printer of a trial: the default printer with the drawn parameters."""
     return replace(Printer(), **draw.printer)  # type: ignore[arg-type]
 
 
 def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
-    """The fields that a trial prints: those that ``litho-data simulate`` prints with this seed."""
+    """The fields of a trial, as ``litho-data simulate`` makes them with this seed."""
     return tuple(random_jobs(Plan(n_scans, (size_px, size_px)), printer_of(draw), draw.seed))
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """Share of its full strength that a cause has in a scan."""
+    """The strength of a cause in a scan, as a share of its full strength."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -63,13 +63,13 @@ def fab_of(
     microscope: Microscope | None = None,
     without: Collection[str] = (),
 ) -> Fab:
-    """The fab as it prints and scans one field, with everything that was planted at the field's strength.
+    """The fab that prints and scans one field, with all planted causes at their strength there.
 
     Args:
         draw: the trial as drawn.
-        planted: base and causes, as `plant` returns them.
-        noise, microscope: in place of the defaults.
-        without: causes that are left out.
+        planted: result of `plant`.
+        noise, microscope: replace the defaults.
+        without: causes to leave out.
     """
     strength = {one.draw.name: one.strength * share_of(one.draw, job) for one in planted}
     strength = {name: own for name, own in strength.items() if name not in without}
@@ -86,18 +86,18 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strengths at which each cause alone has its drawn size on these fields; the base's form first.
+    """Find the strength at which each cause alone has its drawn size on these fields, the base's form first.
 
-    Where the range of a strength ends below that size, its largest value is used and the size that it reaches
-    is recorded: nothing is drawn again. An alias is sized by how much it changes the scans before a refit,
-    because the refit absorbs most of it.
+    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded;
+    nothing is drawn again. An alias is sized by its change of the scans before a refit, because the refit
+    absorbs most of it.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [(_as_alias if draw.kind == "alias" else _sized)(one, jobs, draw) for one in drawn]
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
-    """Print and scan all fields into raw files; returns their card, which states only what it must."""
+    """Print and scan all fields into raw files, and return their card, which states only required facts."""
     (folder / "scans").mkdir(parents=True)
     for job in jobs:
         scan = scan_job(fab_of(draw, planted, job), job)
@@ -129,11 +129,11 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
 
 
 def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer) -> float:
-    """Rms of what a refitted Physics model and the scans' own terms leave of noise-free prints, nm.
+    """Rms residual of noise-free prints, nm, after a refit of the Physics model and the scan terms.
 
     Args:
         heights_um: (y, x) on the layout's grid, µm, one per job.
-        printer: the fit starts from its parameters.
+        printer: gives the start of the fit.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
     model = plain_model(printer)
@@ -146,14 +146,14 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
 
 class _Refit(ModelProblem):
-    """The fit of the model with orthonormal terms of each scan, as a fit to sums of squares needs them."""
+    """Least-squares fit of the model together with orthonormal terms of each scan."""
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]
 
 
 def plain_model(printer: Printer) -> Simulator:
-    """The Physics model at the values at which it is the plain fab."""
+    """The Physics model with the values that reproduce the plain fab."""
     return build_model(
         "physics",
         pitch_um=printer.pitch_um,
@@ -204,7 +204,7 @@ def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
 
 
 def _as_alias(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    """Size an alias by the noise-free scans with it minus those without, freed of the scans' own terms."""
+    """Size an alias by its change of the noise-free scans, without the scan terms."""
     wanted, printer, limit = drawn.wanted_rms_nm, printer_of(draw), _limit(drawn.name)
 
     def change_nm(strength: float) -> float:

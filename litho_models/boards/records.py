@@ -1,4 +1,4 @@
-"""The files of a board: draws, what they hide, the answer of a loop, each trial as judged, the scoreboard."""
+"""The records of a board: draws, hidden causes, answers, judged trials, scoreboard."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from litho_data.foundation.results import Record, Result
 
 Board = Literal["singles", "mixtures"]
 Kind = Literal["in-form", "alias", "other-form", "empty", "mixture", "measured"]
-# Causes of a smaller rms are listed but not counted.
+# Causes with a smaller rms are listed but not counted.
 COUNTS_FROM_RMS_NM = 8.0
 Verdict = Literal[
     "right",
@@ -26,7 +26,7 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A knob or a form, and its wanted size, see `Planted.rms_nm`.
+    """A knob or a form, with its wanted size (see `Planted.rms_nm`).
 
     Attributes:
         by: ``batch``: scans after ``place`` in the printing order have ``weak`` times the strength;
@@ -44,8 +44,8 @@ class Draw(Record):
     """One trial as drawn.
 
     Attributes:
-        seed: decides its layouts, its noise and what its knobs draw.
-        printer: what differs from the default printer; ``base``: a form that no Physics model has.
+        seed: determines layouts, noise and the random values of knobs.
+        printer: parameters that differ from the default printer; ``base``: a form beyond Physics.
     """
 
     number: int
@@ -57,7 +57,7 @@ class Draw(Record):
 
 
 class Draws(Result):
-    """All trials of a board, written before any of them runs; ``base``: the model that loops correct."""
+    """All trials of a board, written before any trial runs; ``base``: the model that loops correct."""
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trial-draws/2"
     FILE_NAME: ClassVar[str] = "draws.json"
@@ -71,12 +71,13 @@ class Draws(Result):
 
 
 class Planted(Record):
-    """A knob or a form as it was set.
+    """A knob or a form as planted.
 
     Attributes:
-        names: names in the effects catalogue that are right for it.
-        strength: in ``unit``; ``at_limit``: its range ended before the wanted size was reached.
-        rms_nm: rms that it alone leaves after a refit of base, scan terms and registration without noise.
+        names: right names in the catalogue of effects.
+        strength: in ``unit``; ``at_limit``: whether its range ended before the wanted size.
+        rms_nm: rms residual that it alone leaves after a refit of base, scan terms and registration, without
+            noise.
     """
 
     draw: CauseDraw
@@ -92,7 +93,7 @@ class Planted(Record):
 
 
 class Hidden(Result):
-    """What one store of a board hides; the loop does not see this file."""
+    """The hidden causes of one store; the loop does not see this file."""
 
     SCHEMA: ClassVar[str] = "litho-models/board-hidden/1"
     FILE_NAME: ClassVar[str] = "hidden.json"
@@ -101,16 +102,16 @@ class Hidden(Result):
 
 
 class Outcome(Record):
-    """What became of one planted cause, or of the whole trial where nothing was planted."""
+    """Outcome of one planted cause, or of the whole trial if nothing was planted."""
 
     name: str
     verdict: Verdict
 
 
 class TrialErrors(Record):
-    """Mean absolute error on held-out scans, k = 1: of the base, with all that was found, of the true models.
+    """Mean absolute errors on held-out scans, k = 1, of base, corrected model and true models.
 
-    For measured prints the true models are unknown.
+    The true models of measured prints are unknown.
     """
 
     before_nm: float
@@ -119,17 +120,17 @@ class TrialErrors(Record):
 
     @property
     def ratio(self) -> float | None:
-        """Ratio of the error with all that was found to that of the true models."""
+        """Ratio of the corrected model's error to that of the true models."""
         return self.after_nm / self.floor_nm if self.floor_nm else None
 
 
 class Found(Record):
-    """One thing that a loop reports.
+    """One finding of a loop.
 
     Attributes:
         names: its name in the catalogue, then those of effects that look the same.
-        by: grouping by which its strength differs; ``scan``: one strength per scan; ``all``: one for all.
-        exponents: intervals of its exponent, where it is a power law.
+        by: grouping in which its strength differs; ``scan``: one strength per scan; ``all``: a common one.
+        exponents: intervals of its exponent, if it is a power law.
     """
 
     names: list[str]
@@ -139,16 +140,16 @@ class Found(Record):
 
 
 class Answer(Result):
-    """What a loop says about one store.
+    """A loop's answer about one store.
 
     Attributes:
         found: causes, laws and descriptions.
-        left: whether something is left that it cannot explain.
+        left: whether the residual has structure that the loop cannot explain.
         absorbed: names of effects that its base absorbs.
         displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
-        before_nm, after_nm: mean absolute error without and with what was found, over the scans that are not
-            locked, each by a fit that has not seen it, one offset per scan free. None: not stated.
-        base_values, corrected_values: values of the Physics model, without and with what was found.
+        before_nm, after_nm: mean absolute error without and with the findings over the scans that are not
+            locked, each predicted by a fit that did not see it, with one free offset. None: not stated.
+        base_values, corrected_values: values of the Physics model, without and with the findings.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/board-answer/1"
@@ -168,9 +169,9 @@ class Trial(Result):
     """The result of one trial; a failed one has a reason and no errors.
 
     Attributes:
-        false_names: sets of causes that the loop named although nothing in them was planted.
-        bias: median of the relative errors of the base's values, without and with what was found; None where
-            the printer is no Physics model, or the loop chose another base.
+        false_names: named sets of causes that contain nothing planted.
+        bias: median relative error of the base's values, without and with the findings; None if printer or
+            chosen base is not a Physics model.
         dataset_cpu_s: processor seconds of build and loop.
     """
 
@@ -191,7 +192,7 @@ class Trial(Result):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending`` are drawn but not run; ``command`` makes the scoreboard again."""
+    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard."""
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trials/3"
     FILE_NAME: ClassVar[str] = "scoreboard.json"

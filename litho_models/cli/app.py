@@ -14,7 +14,6 @@ from litho_data.commands.app import (
     new_app,
     option,
     run_app,
-    with_further_options,
 )
 from litho_data.commands.settings import assigned
 from litho_data.foundation.errors import InputError
@@ -52,29 +51,24 @@ NoiseOption = Annotated[
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    option("fast: one-cycle, with the terms of each scan fitted jointly; paper: 4,000 epochs of Adam"),
+    option("fast: minutes; paper: 4,000 epochs of Adam"),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
     option("ours, as printed in the paper, or as in the authors' code"),
 ]
 Steps = Annotated[int | None, option("optimiser steps; the recipe's by default", min=1)]
-PrecisionOption = Annotated[
-    Literal["bf16-mixed", "32-true"] | None,
-    option("of the products inside networks during training; the recipe's by default", hidden=True),
-]
 Seed = Annotated[int, option("seed of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
-        "FIELD=VALUE of training or model, such as learning_rate=0.001 or spot.sigma_um=0.3; repeatable",
+        "FIELD=VALUE of training or model, as in learning_rate=0.001; repeatable",
         "--set",
     ),
 ]
 
 
 @app.command()
-@with_further_options
 def train(
     store: StorePath,
     model: Annotated[
@@ -88,24 +82,23 @@ def train(
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
-    precision: PrecisionOption = None,
     seed: Seed = 0,
     set_: SetOption = None,
     fix: FixOption = None,
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("also train on the locked scans; then no scan is left to judge by", "--use-lock-box"),
+        option("also train on the locked scans; then no scan is left for a test", "--use-lock-box"),
     ] = False,
 ) -> None:
-    """Train a model on all scans but the locked ones; resumable.
+    """Train a model on all scans except the locked ones; resumable.
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
     from litho_models.frozen.card import bounds_text
     from litho_models.models import fixed_numbers
 
-    settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps, precision=precision)
+    settings = _training(set_, recipe=recipe, variant=variant, seed=seed, steps=steps)
     if fix or free:
         settings["fixed"] = fixed_numbers(model, fix or (), free or ())
     run = litho_models.train(
@@ -159,7 +152,6 @@ def evaluate(
 
 
 @app.command()
-@with_further_options
 @with_paper_copies
 def benchmark(
     store: StorePath,
@@ -171,11 +163,10 @@ def benchmark(
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
-    precision: PrecisionOption = None,
     folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
-        option("fit only this many folds, to compare seeds; all by default", min=1, hidden=True),
+        option("number of folds to fit; all by default", min=1),
     ] = None,
     policy: PolicyOption = None,
     background: SharedOption = None,
@@ -184,10 +175,6 @@ def benchmark(
         bool, option("also score the locked scans; do this once", "--open-lock-box")
     ] = False,
     seed: Seed = 0,
-    training_seed: Annotated[
-        int | None,
-        option("seed of weights and crops alone, with the same split; --seed by default", min=0, hidden=True),
-    ] = None,
     set_: SetOption = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
@@ -200,10 +187,7 @@ def benchmark(
     from litho_models.evaluation.tables import headline_table
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
-    settings = _training(
-        set_, recipe=recipe, variant=variant, steps=steps, precision=precision,
-        seed=training_seed,
-    )  # fmt: skip
+    settings = _training(set_, recipe=recipe, variant=variant, steps=steps)
     result = litho_models.benchmark(
         store,
         out,
@@ -317,7 +301,7 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "what causes the effects of undetermined role, for all of them or for one; repeatable",
+            "cause of effects of undetermined role, for all of them or for NAME; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,
@@ -331,7 +315,7 @@ def freeze(
 
 
 def _attribution(given: Sequence[str]) -> Any:
-    """One side for all effects, or sides by name."""
+    """Parse one side for all effects, or sides by name."""
     if len(given) == 1 and "=" not in given[0]:
         return given[0]
     if wrong := [text for text in given if "=" not in text]:
@@ -347,7 +331,7 @@ def main() -> None:
 
 
 def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
-    """Settings of a training: the options that were given, and those of ``--set``."""
+    """Collect the settings of a training from the given options and ``--set``."""
     found = assigned(words or ())
     if twice := sorted(found.keys() & options.keys()):
         raise InputError("--set", got=f"{twice[0]}, which an option sets", wanted="another setting")

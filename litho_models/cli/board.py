@@ -1,4 +1,4 @@
-"""`litho-models board new` and `judge`: stores that hide causes, and what a loop makes of them."""
+"""`litho-models board new` and `judge`: stores with hidden causes, and the judge of a loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from litho_data.commands.progress import say
 
-board = typer.Typer(help="Blind boards: can a loop name what the virtual fab hides?", no_args_is_help=True)
+board = typer.Typer(help="Blind boards: can a loop name the hidden causes?", no_args_is_help=True)
 
 
 @board.command("new")
@@ -18,7 +18,7 @@ def new(
     kind: Annotated[
         Literal["singles", "mixtures"], typer.Option("--kind", help="one cause per store, or two to four")
     ] = "singles",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="decides what is hidden")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of everything that is drawn")] = 0,
     trials: Annotated[
         int | None, typer.Option("--trials", min=1, help="number of stores; by default all, about 40")
     ] = None,

@@ -1,4 +1,4 @@
-"""`litho-models close-loop`, `next-print`, `check`: what a model lacks, how to find out, does it hold?"""
+"""`litho-models close-loop`, `next-print` and `check`: correct a model, plan prints, monitor a printer."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,10 +12,10 @@ from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
 FixOption = Annotated[
-    list[str] | None, option("a number of the model that no fit changes, such as eta; repeatable", "--fix")
+    list[str] | None, option("parameter of the model that no fit changes, such as eta; repeatable", "--fix")
 ]
 FreeOption = Annotated[
-    list[str] | None, option("a number to fit although it is usually fixed; repeatable", "--free")
+    list[str] | None, option("parameter to fit that is usually fixed; repeatable", "--free")
 ]
 
 
@@ -42,11 +42,13 @@ def close_loop(
     folds: Annotated[int, option("number of folds, by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
-        option("also repeat every choice without each fold, or print, and judge it there; slow"),
+        option("also repeat every choice without each fold, or print, and judge it on that part; slow"),
     ] = None,
     inject: Annotated[
         list[str] | None,
-        option("plant NAME=AMOUNT (in the unit of the effect) in copies of the data: is it found?"),
+        option(
+            "plant NAME=AMOUNT (in the unit of the effect) in copies of the data to see whether it is found"
+        ),
     ] = None,
     open_lock_box: Annotated[
         bool, option("also score the locked scans; do this once", "--open-lock-box")
@@ -95,7 +97,7 @@ def close_loop(
     typer.echo(f"report: {out / 'report.html'}")
 
 
-# Neither bad input (2) nor a defect of this package (1).
+# Other than the codes for bad input (2) and for a defect of this package (1).
 EXIT_ALARM = 3
 
 
@@ -111,10 +113,6 @@ def check(
         list[str] | None,
         option("a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
-    residuals: Annotated[
-        list[Path] | None,
-        option("folder of `benchmark` on the reference prints, for errors on prints that no fit had seen"),
-    ] = None,
     false_alarms: Annotated[float, option("share of unchanged data sets that raise an alarm")] = 0.005,
     tolerance: Annotated[
         float | None,
@@ -122,7 +120,7 @@ def check(
     ] = None,
     strict: Annotated[bool, option(f"end with exit code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
-    """Tell whether new prints differ from those a model was made of, and when to measure again.
+    """Tell whether new prints differ from the reference prints of a model, and when to measure again.
 
     Example: litho-models check printer new-prints.zarr --out check
     """
@@ -134,7 +132,6 @@ def check(
         out,
         reference=reference,
         new=new or (),
-        residuals=residuals or (),
         false_alarms=false_alarms,
         tolerance=tolerance,
     )
@@ -152,12 +149,12 @@ def next_print(
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],
-        option("random: a control, with the same scans of layouts that are not optimised"),
+        option("random: the same scans of layouts that are not optimised, as a control"),
     ] = "optimised",
     seed: Annotated[int, option("seed of the random layouts to start from", min=0)] = 0,
     steps: Annotated[int, option("steps of the ascent for each tile", min=0)] = 40,
 ) -> None:
-    """Plan the prints and scans that decide what a closed loop left open; resumes after a kill.
+    """Plan the prints and scans that decide the open questions of a closed loop; resumable.
 
     Example: litho-models next-print loop --out plan
     """

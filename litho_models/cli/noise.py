@@ -1,7 +1,8 @@
-"""`litho-models noise`: what no model of the printer can predict."""
+"""`litho-models noise`: the error that no model of the printer can predict."""
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,13 +10,8 @@ import litho_models
 from litho_data.commands.app import argument, option
 from litho_data.foundation.errors import InputError
 
-# What only single files need, and what only a store has.
-OF_FILES = ("substrate", "flat", "steps", "unit", "size_um", "level_height_um")
-OF_A_STORE = ("residuals", "model", "seed")
-
 
 def noise(
-    context: typer.Context,
     out: Annotated[Path, option("folder for noise.json, report and tables")],
     store: Annotated[
         Path | None, argument("dataset store; its scans marked substrate, flat or steps are used")
@@ -28,12 +24,14 @@ def noise(
         tuple[float, float] | None,
         option("their size in µm where the files state none", metavar="Y X"),
     ] = None,
-    level_height_um: Annotated[float, option("nominal step of the step print, µm")] = 0.1,
+    level_height_um: Annotated[
+        float | None, option("nominal step of the step print, µm; 0.1 by default")
+    ] = None,
     residuals: Annotated[
-        list[str] | None,
+        str | None,
         option(
             "folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
-            "zoo:NAME), for σ(x) alone; several are an ensemble; repeatable"
+            "zoo:NAME), for σ(x) alone"
         ),
     ] = None,
     model: Annotated[str | None, option("which model of the benchmark; its best one by default")] = None,
@@ -46,40 +44,29 @@ def noise(
     from litho_models.noise import analyse_noise_of_files
     from litho_models.noise.report import noise_verdict
 
-    _check_given(context)
+    files: dict[str, Any] = {"substrate": substrate, "flat": flat, "steps": steps}
+    files |= {"unit": unit, "size_um": size_um, "level_height_um": level_height_um}
+    of_files = {name: value for name, value in files.items() if value is not None}
+    of_a_store = _options(name for name, value in (("residuals", residuals), ("model", model)) if value)
+    given = _options(of_files)
+    if store is not None and of_files:
+        raise InputError("noise", got=f"a store and {given}", wanted="a store, or files without one")
     if store is not None:
-        result = litho_models.analyse_noise(store, out, residuals=residuals or (), model=model, seed=seed)
+        result = litho_models.analyse_noise(store, out, residuals=residuals, model=model, seed=seed)
+    elif flat is None:
+        wanted = "a store, or --flat and its scan"
+        raise InputError("noise", got=given or "nothing to analyse", wanted=wanted)
+    elif of_a_store:
+        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
+    elif level_height_um is not None and steps is None:
+        raise InputError("noise", got="--level-height-um", wanted="--steps too, the scan of the steps")
     else:
-        result = analyse_noise_of_files(
-            out,
-            flat=Path(flat or ""),
-            substrate=substrate,
-            steps=steps,
-            unit=unit,
-            size_um=size_um,
-            level_height_um=level_height_um,
-        )
+        result = analyse_noise_of_files(out, **of_files)
     typer.echo(noise_verdict(result.noise_floor))
     if result.dose is not None:
         typer.echo(f"recommended dose {result.dose.recommended_dose:g}: {result.dose.reason}")
     typer.echo(f"report {out / 'report.html'}")
 
 
-def _check_given(context: typer.Context) -> None:
-    """Require a store, or files with a flat print among them, and only the options of the one given."""
-    sources = {name: context.get_parameter_source(name) for name in context.params}
-    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
-
-    def options(names: tuple[str, ...]) -> str:
-        return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
-
-    if "store" in given and (of_files := options(OF_FILES)):
-        raise InputError("noise", got=f"a store and {of_files}", wanted="a store, or files without one")
-    if "store" not in given and "flat" not in given:
-        raise InputError(
-            "noise", got=options(OF_FILES) or "nothing to analyse", wanted="a store, or --flat and its scan"
-        )
-    if "flat" in given and (of_a_store := options(OF_A_STORE)):
-        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
-    if "level_height_um" in given and "store" not in given and "steps" not in given:
-        raise InputError("noise", got="--level-height-um", wanted="--steps too, the scan of the steps")
+def _options(names: Iterable[str]) -> str:
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names)

@@ -1,4 +1,4 @@
-"""A base model with effects at their stages, and the part of it that design may use."""
+"""A base model with effects, and the part of it that designs may use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_models.effects.effect import ActsOn, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
 from litho_models.simulator import Simulator, Tile
 
-# What an effect turns with, where the microscope sees a print turned.
+# Whether an effect turns with the print or with the scan.
 Frame = Literal["scan", "print"]
 
 
@@ -20,9 +20,9 @@ class EffectChain(nn.Module):
 
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
-        effects: effect name to parameter values; parameters not named are off.
-        frames: what an effect on the height turns with, where it is not its stage's: those of the stage
-            ``measurement`` go with the scan, all others with the print.
+        effects: effect name to parameter values; unnamed parameters are off.
+        frames: what a height effect turns with, if it differs from the default: effects of stage
+            ``measurement`` turn with the scan, all others with the print.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class EffectChain(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of the base model; the effects act on the whole field."""
+        """The tile of the base model. Effects act on the whole field."""
         return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
-        """Height (b, 1, y, x), µm; without a context the field is a write field of its own."""
+        """Height (b, 1, y, x), µm. Without a context the field is one write field."""
         if context is None:
             assert isinstance(self.base, Simulator)
             geometry = self.base.config
@@ -54,11 +54,11 @@ class EffectChain(nn.Module):
         return self.after_base(self.base(self.before_base(layout_um, context)), context)
 
     def before_base(self, layout_um: Tensor, context: FieldContext) -> Tensor:
-        """The layout as the base model gets it."""
+        """The layout after the effects that act before the base model."""
         return self._run_stage("layout", layout_um, context)
 
     def after_base(self, height_um: Tensor, context: FieldContext) -> Tensor:
-        """The base model's height with the height effects."""
+        """The base model's height after the height effects."""
         return self._run_stage("height", height_um, context)
 
     def _run_stage(self, acts_on: ActsOn, field: Tensor, context: FieldContext) -> Tensor:

@@ -1,4 +1,4 @@
-"""What an effect is: a small differentiable change of the layout or of the height, off at its null."""
+"""Define an effect: a differentiable change of the layout or the height that vanishes at its null."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
-# What it says to have found an effect: why, by which formula, or only where.
+# What a found effect tells: the cause, a formula, or only a dependence.
 Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
-# Share of a range: a value fitted to a bound is stored in float32.
+# Tolerance as a share of a range, because a value on its bound is stored in float32.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect.
+    """One parameter of an effect.
 
     Args:
         unit: ``1`` for dimensionless.
         lower, upper: physical range; an estimate outside it contradicts the effect.
-        typical: a value of ordinary size, where screening looks and fitting starts.
-        kind: ``amplitude`` switches the effect off at ``null``; ``shape`` (a length, a position) is
-            without meaning while the amplitudes are null; ``choice`` is a shape that takes few
-            values (a direction) and is never fitted.
-        null: the amplitude's value at which the effect is the identity.
-        tried: values that screening tries; ``typical`` if there are none.
+        typical: a usual value, for screening and as start of fits.
+        kind: an ``amplitude`` switches the effect off at ``null``; a ``shape`` (a length, a position) has no
+            meaning while the amplitudes are null; a ``choice`` is a shape with few values (a direction),
+            never fitted.
+        null: value of an amplitude at which the effect is the identity.
+        tried: values for screening; ``typical`` if empty.
     """
 
     unit: str
@@ -57,24 +57,24 @@ class Parameter:
 
 @dataclass(frozen=True)
 class FieldContext:
-    """What an effect may know about a field besides the array it acts on.
+    """What an effect may know about a field, besides the array that it acts on.
 
     Args:
-        layout_um: nominal height times the relative dose (1, 1, y, x), µm: what is exposed.
+        layout_um: exposure, as nominal height times relative dose (1, 1, y, x), µm.
         pitch_um: lateral sampling, µm.
-        full_height_um: nominal height of the highest level, µm; scales the pointwise effects.
+        full_height_um: nominal height of the highest level, µm, the scale of pointwise effects.
         slice_um: height of one slice, which is one level, µm.
         field_centre_um: (y, x) of this field's centre in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
-        slow_axis: the axis along which the written lines follow each other.
+        slow_axis: axis along which written lines follow each other.
         order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
-        scan_shape: (rows, columns) of the whole scan where this field is a part of it.
+        scan_shape: (rows, columns) of the whole scan, if this field is a part of it.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
-        backward: the scan lines were recorded on the way back.
-        new_tip: scanned with another tip than the rest, a sharp one.
-        pixel_size: of the scan, relative to the rest: what lags in time goes with it.
-        dose: of the print, relative to the recipe's; ``layout_um`` holds it already.
+        quarter_turns: number of quarter turns (as by ``rot90``) in which the microscope saw the array.
+        backward: whether the scan lines are the retrace.
+        new_tip: whether another, sharp tip was used.
+        pixel_size: pixel size relative to other scans; lags in time scale with it.
+        dose: dose relative to the recipe, already contained in ``layout_um``.
     """
 
     layout_um: Tensor
@@ -95,13 +95,13 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """What an effect makes of the field alone, whatever its numbers: made once."""
+        """Cache what an effect computes from the field alone."""
         if name not in self._kept:
             self._kept[name] = make(self)
         return self._kept[name]
 
     def in_scan_frame(self) -> FieldContext:
-        """The same field as the microscope saw it, its fast axis along x."""
+        """The field in the frame of the scan, with the fast axis along x."""
         if not self.quarter_turns % 4:
             return self
         (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
@@ -139,7 +139,7 @@ class FieldContext:
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
-        """Half the write field; without a write field in the card, half the longer side of this one."""
+        """Half the write field, or half the longer side of this field if the card states no write field."""
         if self.field_radius_um is not None:
             return self.field_radius_um
         return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
@@ -149,7 +149,7 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The formula of an effect that has none: each scan has its own, which its scan terms fit."""
+    """Placeholder formula of a per-scan effect, whose scan terms are fitted to each scan."""
     raise InputError(
         "an effect in a model", got="one with a value for each scan", wanted="one with a value for all scans"
     )
@@ -161,21 +161,21 @@ class Effect:
 
     Args:
         name: the identifier used in code, JSON and on the command line.
-        title: what it is, in words for a process engineer.
-        stage, role: where it happens; whether it may enter the exported process model.
+        title: short description for a process engineer.
+        stage, role: stage of the process; whether the effect may enter the exported process model.
         acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
         parameters: name to ``Parameter``; at least one amplitude.
-        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm;
-            ``of_single_scans`` for what scan terms fit.
-        trials: parameter sets (those not named are off) at which screening takes the secant
-            direction; by default one amplitude at a time, at each of its values to be tried, in each shape.
-        source: where the formula comes from.
-        separating: the experiment that tells it apart from what looks alike.
-        needs: facts about the print without which it cannot be tested.
-        reverses: parameters whose sign is the other way round on lines recorded on the way back.
-        of_tip: it belongs to the tip, and a new one does not have it.
-        of_films: it moves the edges of a film seen from above; any other is of heights.
-        knowledge: a cause has a name; a law only a formula; a description only a covariate.
+        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm; ``of_single_scans``
+            for per-scan effects.
+        trials: parameter sets at which screening takes secants; by default one amplitude at a time, at each
+            of its ``tried`` values, in each shape.
+        source: source of the formula.
+        separating: experiment that separates it from similar effects.
+        needs: facts about the print that its test requires.
+        reverses: parameters with the opposite sign on retrace lines.
+        of_tip: whether a new tip removes it.
+        of_films: whether it moves the edges of a film seen from above; other effects change heights.
+        knowledge: a cause has a name, a law only a formula, a description only a covariate.
     """
 
     name: str
@@ -205,7 +205,7 @@ class Effect:
 
     @property
     def per_scan(self) -> bool:
-        """Whether its parameters belong to one scan and have no value shared by all."""
+        """Whether every scan has its own parameters."""
         return self.apply is of_single_scans
 
     def _trials(self) -> Iterator[dict[str, float]]:
@@ -221,7 +221,7 @@ class Effect:
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """The off values with some replaced.
+        """Parameters at their off values, with some replaced.
 
         Raises:
             InputError: a name this effect does not have.
@@ -251,10 +251,11 @@ class Effect:
         context: FieldContext,
         scanned: bool = False,
     ) -> Tensor:
-        """Apply the effect; numbers become tensors on the array's device, parameters not named are off.
+        """Apply the effect. Numbers become tensors on the array's device; unnamed parameters are off.
 
         Args:
-            scanned: as one of the microscope, in the frame, the direction and with the tip of the scan.
+            scanned: apply it as an effect of the microscope, in the scan's frame and direction, with the
+                scan's tip.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
@@ -280,7 +281,9 @@ def entry(
     acts_on: ActsOn,
     **facts: Any,
 ) -> Callable[[Apply], Effect]:
-    """Makes an effect of a formula, under the formula's name; ``facts``: the other fields of ``Effect``."""
+    """Make a decorator that turns a formula into an effect of the same name; ``facts``: other fields of
+    ``Effect``.
+    """
 
     def of_formula(apply: Apply) -> Effect:
         name = apply.__name__.replace("_", "-")
@@ -289,7 +292,7 @@ def entry(
     return of_formula
 
 
-# Where most effects happen; an entry that differs says so.
+# Usual stages and roles of effects.
 of_exposure = partial(entry, stage="exposure", role="process", acts_on="layout")
 of_resist = partial(entry, stage="resist", role="process", acts_on="height")
 of_development = partial(entry, stage="development", role="process", acts_on="height")

@@ -1,4 +1,4 @@
-"""Exposure: shape and background of the writing spot, and slices that set one by one."""
+"""Exposure: shape and background of the writing spot, and separately cured slices."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
-# Below this difference of variances the spot is sharpened along one axis as much as it is widened
-# along the other; above it only widened, so that the filter never amplifies without bound.
+# Up to this difference of variances the spot is sharpened along one axis as much as it is widened along the
+# other. Above it the spot is only widened, to limit amplification.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
 
-# The spot that sets the slices.
+# The spot that cures the slices.
 _SLICED_VARIANCE_UM2 = 0.02
 _SLICED_REACH_UM = 0.8
 
@@ -73,7 +73,7 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
 
 
 @of_exposure(
-    "slices setting one by one",
+    "slices curing separately",
     {
         "share": Parameter("1", 0.0, 1.0, 0.3),
         "threshold": Parameter("1", 0.2, 0.8, 0.5, "shape", tried=(0.35, 0.5, 0.65)),
@@ -84,10 +84,10 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     separating="pillars and pits of one width and several heights, one slice and many",
 )
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """(1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M: slices of height t set one by one.
+    """(1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M: slices of height t cure separately.
 
-    The step is logistic about the threshold and maps 0 to 0 and 1 to 1: a slice narrower than the
-    spot is lost, a gap narrower than it is filled, which a column of many slices would average out.
+    The step is logistic about the threshold and maps 0 to 0 and 1 to 1. A slice narrower than the spot is
+    lost, and a gap narrower than the spot is filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
@@ -95,10 +95,10 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _exposed_slices(context: FieldContext) -> Tensor:
-    """Exposure (slices, 1, y, x) of each slice through the spot, 1 where it is exposed in full."""
+    """Exposure (slices, 1, y, x) of each slice by the spot; 1: fully exposed."""
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
-    # Another dose is another exposure of as many slices.
+    # The dose changes the exposure, not the number of slices.
     number = layout / (context.dose * context.slice_um)
     slices = context.dose * torch.clamp(number - torch.arange(count).to(layout)[:, None, None], 0, 1)
     slices = slices.reshape(count, 1, *layout.shape[-2:])

@@ -1,4 +1,4 @@
-"""Exposure: what place and order in the write field leave behind, and the motion of writing."""
+"""Exposure: effects of position and order in the write field, and of the writing motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# A slower wave is no ripple: maps of the field look like it.
+# Longest ripple; slower waves look like maps of the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
@@ -60,7 +60,7 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("order",),
 )
 def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = M (1 + ρ t), t the place in the writing order from -0.5 to 0.5."""
+    """D = M (1 + ρ t), t the position in the writing order from -0.5 to 0.5."""
     return layout * (1 + values["drift"] * context.order)
 
 
@@ -77,9 +77,9 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     separating="leave bare substrate in every field",
 )
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max(H - z, H_s) where H > H_s, the substrate: writing starts below it, and that part is lost.
+    """max(H - z, H_s) where H > H_s, the substrate: the part written below the substrate is lost.
 
-    The part would have shrunk like the rest, z = z0 (1 - k (1 - u)), u the relative nominal height nearby.
+    The lost part shrinks like the rest, z = z0 (1 - k (1 - u)), u the relative nominal height nearby.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -97,7 +97,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The beam follows the command late: one-sided exponential of length l = v τ, without its mean delay."""
+    """The beam lags: one-sided exponential of length l = v τ, without its mean delay."""
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -115,9 +115,9 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
 )
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line loses δ at both ends, or gains it.
+    """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line is shorter by δ at both ends, or longer.
 
-    What an edge loses is right in its area; the spot, which is wider than δ, makes its shape.
+    The formula is right for the lost area of an edge. The spot, which is wider than δ, determines its shape.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -132,7 +132,7 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """M(x + c (r² / 3 - x²) / 2R) along the written lines, x from the centre of a field of half width r.
 
-    That is c x (1 - x / 2R) over the write field, R its half width, without what registration has taken out.
+    That is c x (1 - x / 2R) over the write field of half width R, without the part that registration removes.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -144,7 +144,7 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
 
 
 @of_exposure(
-    "resist remembering what was written just before",
+    "resist depleted by the lines written just before",
     {
         "strength": Parameter("1", -0.6, 0.6, 0.05),
         "length_um": Parameter("µm", 0.4, 20.0, 3.0, "shape", tried=(1.0, 3.0, 9.0)),
@@ -155,7 +155,7 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     separating="print the same layout with the writing order reversed",
 )
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: the lines before starve the resist."""
+    """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: earlier lines deplete the resist."""
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -164,7 +164,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach_um = _TAIL_LENGTHS * float(length.detach())
     starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
-    # Where another effect has left a negative dose, that is not for this one to mend.
+    # A negative dose from another effect is left as it is.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 
@@ -184,8 +184,8 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
 
-    Sampled at the pixel dx, they show at f = |1/p - 1/dx|. The write field gives them their phase,
-    the same in every print.
+    Sampled at the pixel dx, they appear at f = |1/p - 1/dx|. The write field fixes their phase, which is the
+    same in every print.
     """
     y, x = context.centred_um()
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)

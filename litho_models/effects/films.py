@@ -1,6 +1,6 @@
-"""Films: what moves the edges of a film that is written, developed or etched, and seen from above.
+"""Films: effects that move the edges of a written, developed or etched film, seen from above.
 
-Lengths are in pixels of the layout, which resolve the machine that writes, be it a beam or a lens.
+Lengths are in pixels of the layout, which resolve the beam or lens of the machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp, gradient
 from litho_models.models.parts import FLATTEST, etch
 
-# Blurs of a film that give its edges a normal, and a sharp rim a place; reach of a diffusion.
+# Blurs of a film that define the normals of its edges and the position of a sharp rim; range of a diffusion.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
 
 _of_films = partial(entry, role="process", of_films=True)
@@ -33,14 +33,14 @@ _of_films = partial(entry, role="process", of_films=True)
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = (M + η G_b * M) / (1 + η): the dose of what is written within b comes back."""
+    """D = (M + η G_b * M) / (1 + η): part of the dose within b returns from the substrate."""
     weight, length = values["weight"], values["length_px"]
     blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
 
 
 @_of_films(
-    "what the dose made spreading before there is an edge",
+    "reaction products spreading before the edge forms",
     {"variance_px2": Parameter("px²", 0.0, 150.0, 8.0, tried=(8.0, 45.0))},
     stage="resist",
     acts_on="height",
@@ -48,11 +48,11 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     separating="write necks and islands of five widths, bake for two times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The film blurred by a Gaussian of variance s², and its edge put where the blurred film is one half."""
+    """The film blurred by a Gaussian of variance s², with its edge where the blurred film is one half."""
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
-        # A sharp rim says too little of where within a pixel its edge is: both are blurred by some.
+        # A sharp rim does not locate its edge within a pixel, so both films are slightly blurred.
         blurred = add_blur(height / full, variance_px2 + _RIM_PX**2, 1.0, _DIFFUSION_REACH_PX)
         return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, 1.0)
 
@@ -69,7 +69,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     separating="write one layout at five doses: a bias is the same at each",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H looked up at a distance of the bias inward: along the normal, edges move outward by it."""
+    """H taken at the distance of the bias inwards, so edges move outwards by the bias along their normals."""
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)

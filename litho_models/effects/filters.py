@@ -1,4 +1,4 @@
-"""Linear filters, gradients and warps that the effects share; each is exactly zero at zero strength."""
+"""Linear filters, gradients and warps for effects; at zero strength each changes nothing, to the bit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext
 
-# Slope below which a power of it is rounded off.
+# Slope below which its powers are smoothed.
 _LEAST_SLOPE = 1e-3
 
 
@@ -28,7 +28,7 @@ def add_filtered(
         field: (b, 1, y, x).
         transfer_minus_one: (fy, fx) in cycles/µm, shapes (y, 1) and (1, x/2 + 1) -> T(f) - 1.
         pitch_um: sampling, µm.
-        reach_um: half the support of the kernel; the field is continued by it as the base models continue it.
+        reach_um: half the support of the kernel, by which the field is continued as in the base models.
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
@@ -68,7 +68,7 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
 
 
 def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """``trailing_response`` without its mean delay l, which registration has taken out of a scan."""
+    """``trailing_response`` without its mean delay l, because registration removes a mean shift."""
     advance = torch.exp(2j * math.pi * frequency * length_um)
     return trailing_response(frequency, length_um, pitch_um) * advance
 
@@ -82,12 +82,12 @@ def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 
 def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
-    """A power of the size of a slope, zero without one, rounded off near zero so that it has a derivative."""
+    """A power of the absolute slope, smoothed near zero to be differentiable."""
     return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
 
 
 def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
-    """Field looked up at (y + shift_y, x + shift_x), cubic; a zero shift gives the field bit for bit.
+    """Field at (y + shift_y, x + shift_x) by cubic interpolation; a zero shift returns the field bit for bit.
 
     Args:
         field: (1, 1, y, x).

@@ -1,8 +1,8 @@
-"""Laws without a name: short formulas of the height, its slopes and surroundings, the place and the order.
+"""Laws: short formulas of height, slopes, surroundings, position and order.
 
-Each is an effect like any other, with one strength, so that it is screened, fitted, judged and applied by the
-same code. It says by which formula the height departs from the model, not why. Tables are the same with many
-strengths: they follow whatever their covariate carries, and explain nothing.
+A law is an effect with one strength (and the position of a jump), so the same code screens, fits, judges and
+applies it. It states how the height departs from the model, not why. Tables have many strengths; they follow
+any dependence on their covariate and explain nothing.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from litho_models.effects.effect import Apply, Effect, FieldContext, Parameter, 
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
+_RIM_UM = 2.0
+_WORDS = ("x", "y", "r²", "rim")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
     f"from_{1000 * dy:+.0f}_{1000 * dx:+.0f}_nm": (dy, dx)
@@ -31,7 +33,7 @@ _POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j
 _TURN = "print and scan the same layouts turned by 90 degrees"
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
 _DIAGONAL = 0.5**0.5
-# (y, x) of the directions along which a slope is taken.
+# Directions of slopes, as (y, x).
 _DIRECTIONS = {
     "x": (0.0, 1.0),
     "y": (1.0, 0.0),
@@ -42,34 +44,47 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Surface:
-    """What formulas speak of: a height h (b, 1, y, x), µm, in its field."""
+    """Quantities for formulas, from a height h (b, 1, y, x), µm, its field, and the law's parameters."""
 
     h: Tensor
     context: FieldContext
+    values: Values
 
     def slope(self, direction: str, of: Tensor | None = None) -> Tensor:
-        """Slope of a map, of the height unless given, along a direction by central differences."""
+        """Slope of a map (by default the height) along a direction, by central differences."""
         along_y, along_x = _DIRECTIONS[direction]
         y, x = gradient(self.h if of is None else of, self.context.pitch_um)
         return along_y * y + along_x * x
 
     def size(self, power: float, *directions: str) -> Tensor:
-        """A power of the size of a slope, or of the steepness, rounded off near zero so that it is smooth."""
+        """A power of the absolute slope along a direction, or of the steepness, smoothed near zero."""
         squared = torch.stack([self.slope(one) for one in directions]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """x, y, or r² of the pixel in its scan."""
+        """x, y, r² or the closeness to the scan's edge, e^(-distance / 2 µm), of each pixel."""
         y, x = self.context.scan_position()
+        if word == "rim":
+            sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
+            own_um = [side * (1 - one.abs()) for side, one in zip(sides_um, (y, x), strict=True)]
+            return torch.exp(-torch.minimum(*own_um) / _RIM_UM).to(self.h)
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
+    def beyond(self, axis: str) -> Tensor:
+        """A step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
+        pixel.
+        """
+        y, x = self.context.scan_position()
+        at, size = (y, self.context.whole_shape()[0]) if axis == "y" else (x, self.context.whole_shape()[1])
+        return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h) + 0 * self.h
+
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
-        """Mean nearby of a map, of the height unless given, weighted by a Gaussian."""
+        """Gaussian-weighted local mean of a map, by default the height."""
         field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
         return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
 
     def beside(self, side: str, length_um: float) -> Tensor:
-        """Mean height on one side, weighted by an exponential of that length."""
+        """Exponentially weighted mean height on one side, with the given decay length."""
         axis, sign = _SIDES[side]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
@@ -79,18 +94,18 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
     def along(self, direction: str, length_um: float) -> Tensor:
-        """Mean height along a direction, to both sides, weighted by an exponential of that length."""
+        """Exponentially weighted mean height along a direction, to both sides."""
         along_y, along_x = _DIRECTIONS[direction]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            # Both sides together: their phases cancel.
+            # The phases of both sides cancel.
             return trailing_response(along_y * fy + along_x * fx, length, pitch).real - 1
 
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
 
-# The map that a strength multiplies, (b, 1, y, x).
+# Computes the map (b, 1, y, x) that a strength multiplies.
 Column = Callable[[Surface], Tensor]
 
 
@@ -104,13 +119,14 @@ def _columns() -> Iterator[Facts]:
         yield from _one_way(axis)
     for axis in ("x", "y"):
         yield from _along_axis(axis)
-        yield from (_slope_at(axis, word) for word in ("x", "y", "r²"))
+        yield from (_slope_at(axis, word) for word in _WORDS)
     yield "steepness-power-1", "|∇h|", "1", lambda s: s.size(1, "x", "y")
     yield "steepness-power-2", "|∇h|²", "1", lambda s: s.size(2, "x", "y")
     yield "height-power-2", "h²", "µm²", lambda s: s.h**2
     yield "height-power-3", "h³", "µm³", lambda s: s.h**3
     yield "height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order
-    yield from (_height_at(word) for word in ("x", "y", "r²"))
+    yield from (_height_at(word) for word in _WORDS)
+    yield from (_surroundings_at(word) for word in _WORDS)
     for reach_um in _REACHES_UM:
         yield from _nearby(reach_um)
     yield from (_to_both_sides(axis, length_um) for axis in _DIRECTIONS for length_um in _TAILS_UM[1:])
@@ -143,10 +159,28 @@ def _height_at(word: str) -> Facts:
     return f"height-times-{word.replace('²', '2')}", f"h {word}", "µm", lambda s: s.h * s.place(word)
 
 
+def _surroundings_at(word: str) -> Facts:
+    reach_um = _REACHES_UM[1]
+    name, formula = f"blur-{word.replace('²', '2')}-{reach_um:g}-um", f"(h̄({reach_um:g} µm) - h) {word}"
+    return name, formula, "µm", lambda s: (s.mean(reach_um) - s.h) * s.place(word)
+
+
+def _jumps(axis: str) -> Iterator[Facts]:
+    name, formula = f"jump-along-{axis}", f"({axis} > {axis}0)"
+    yield f"{name}-in-height", formula, "1", lambda s: s.beyond(axis)
+    yield f"{name}-in-gain", f"h {formula}", "µm", lambda s: s.h * s.beyond(axis)
+    yield from (_displaced(name, formula, axis, way) for way in ("x", "y"))
+
+
+def _displaced(name: str, formula: str, axis: str, way: str) -> Facts:
+    return f"{name}-in-{way}", f"∂h/∂{way} {formula}", "1", lambda s: s.slope(way) * s.beyond(axis)
+
+
 def _nearby(reach_um: float) -> Iterator[Facts]:
     mean, within = f"h̄({reach_um:g} µm)", f"{reach_um:g}-um"
     yield f"surroundings-{within}", f"{mean} - h", "µm", lambda s: s.mean(reach_um) - s.h
-    yield f"height-times-surroundings-{within}", f"h {mean}", "µm²", lambda s: s.h * s.mean(reach_um)
+    blurred = f"h ({mean} - h)"
+    yield f"blur-height-{within}", blurred, "µm²", lambda s: s.h * (s.mean(reach_um) - s.h)
     yield f"above-surroundings-{within}", f"(h - {mean})²", "µm²", lambda s: (s.h - s.mean(reach_um)) ** 2
     steps = f"mean of |∇h| within {reach_um:g} µm"
     yield f"steps-within-{within}", steps, "1", lambda s: s.mean(reach_um, s.size(1, "x", "y"))
@@ -162,23 +196,23 @@ def _to_one_side(side: str, length_um: float) -> Facts:
     return name, formula, "µm", lambda s: s.beside(side, length_um) - s.h
 
 
-def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
+def _law(name: str, formula: str, unit: str, column: Column, **shapes: Parameter) -> Effect:
     unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
     def apply(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-        return height + values["strength"] * column(Surface(height, context))
+        return height + values["strength"] * column(Surface(height, context, values))
 
     return Effect(
-        # It may be a part of the name of a parameter.
+        # The name may become part of a parameter's name.
         name=name.replace(".", "-"),
         title=f"height changed by {formula}",
         stage="development",
         role="undetermined",
         acts_on="height",
-        parameters={"strength": Parameter(unit_of_strength[unit], -2.0, 2.0, 0.05)},
+        parameters={"strength": Parameter(unit_of_strength[unit], -2.0, 2.0, 0.05), **shapes},
         apply=apply,
         source="found in the residual; h in µm, h̄ its Gaussian mean, x and y from -1 to 1 over the scan, "
-        "r² = x² + y², the order t from -0.5 to 0.5",
+        "r² = x² + y², rim = e^(-distance to the edge / 2 µm), the order t from -0.5 to 0.5",
         separating=_TURN,
         knowledge="law",
     )
@@ -195,7 +229,7 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
     )
 
 
-@_table("a height of its own for each level", _KNOTS, "µm")
+@_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """One correction for each of seventeen heights of the layout, linear between them."""
     knots = torch.stack([values[name] for name in _KNOTS])
@@ -208,7 +242,9 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
+    """A weight for the height difference to each displaced position; the field is continued beyond its
+    edge.
+    """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
@@ -219,12 +255,14 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
     return total
 
 
-@_table("a gain that follows the place in the scan", _POWERS, "1")
+@_table("a gain that depends on the position in the scan", _POWERS, "1")
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The height times a polynomial of the place in the scan."""
+    """The height times a polynomial of the position in the scan."""
     y, x = context.scan_position()
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 
 
-LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
+_POSITION = Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
+_OF_JUMPS = [_law(*facts, position=_POSITION) for axis in ("x", "y") for facts in _jumps(axis)]
+LAWS = {law.name: law for law in (*(_law(*facts) for facts in _columns()), *_OF_JUMPS)}
 TABLES = {one.name: one for one in (level_table, linear_response, place_map)}

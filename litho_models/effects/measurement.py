@@ -1,4 +1,4 @@
-"""Measurement: the tip, whose flanks touch before its end does, the feedback, and the lateral scanner."""
+"""Measurement: effects of tip, feedback and lateral scanner."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_models.effects.filters import add_blur, add_warp
 # Cubic interpolation half-way between four neighbours.
 _MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
 _SHARPEST_UM = 1e-3
-# Of the radius, along the sharper axis of an asymmetric tip.
+# Relative radius along the sharper axis of an asymmetric tip.
 _SHARPER = 0.25
 _BLUR_REACH_UM = 4.0
 
@@ -31,11 +31,11 @@ _BLUR_REACH_UM = 4.0
     reverses=("direction",),
 )
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The probe follows late along the fast axis, mean delay taken out: z += (H - z) / (1 + l / dx).
+    """The probe lags along the fast axis, mean delay removed: z += (H - z) / (1 + l / dx).
 
-    The length l holds on the way down. On the way up, where the surface pushes, it is a part of it:
-    with 1 the probe is a linear filter, below 1 it parachutes off falling edges. The delay is one of time:
-    with smaller pixels it is shorter.
+    The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
+    At 1 the probe is a linear filter; below 1 it parachutes off falling edges. The delay is a time, so the
+    length is shorter with smaller pixels.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -59,9 +59,9 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     reverses=("strength",),
 )
 def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: its x axis runs fast in the middle of a line.
+    """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: the scanner runs fast in the middle of a line.
 
-    That is c x (1 - x / L) without its mean, which registration has taken out of a scan.
+    That is c x (1 - x / L) without its mean, because registration removes a mean shift.
     """
     y, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -75,9 +75,9 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     separating="register with two interpolation kernels; scan with half the pixel size",
 )
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass.
+    """A Gaussian blur of the finished scan, by interpolation or by the microscope's low-pass filter.
 
-    Either is one of pixels: smaller ones blur less.
+    Its width is a number of pixels, so smaller pixels blur less.
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
@@ -101,14 +101,14 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     of_tip=True,
 )
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max over u of H(x - u) - u² / 2R, the path of a paraboloid; H + R |grad H|² / 2 to first order.
+    """max over u of H(x - u) - u² / 2R, the path of a paraboloid tip; to first order H + R |grad H|² / 2.
 
-    A tip may be sharper along the scan lines or across them: ``along`` and ``across`` are shares of R.
+    A tip may be sharper along or across the scan lines; ``along`` and ``across`` are shares of R.
     """
     radius = values["radius_um"]
-    # The formula divides by the radius: a sharper tip is taken in proportion, down to none at all.
+    # The formula divides by the radius, so the change is scaled linearly to zero for very sharp tips.
     blunt = radius.clamp(min=_SHARPEST_UM)
-    # A paraboloid is the sum of two parabolas: the axes take their maxima one after the other.
+    # A paraboloid is the sum of two parabolas, so the maximum is taken along one axis after the other.
     across, along = blunt * values["across"], blunt * values["along"]
     columns_done = _dilate_rows(height.transpose(-1, -2), across, context.pitch_um).transpose(-1, -2)
     dilated = _dilate_rows(columns_done, along, context.pitch_um)
@@ -116,10 +116,10 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
-    """Dilation of rows (..., x) by a parabola; the surface is straight between half pixels.
+    """Dilate rows (..., x) by a parabola; the surface is linear between half pixels.
 
-    On a straight piece of slope s the tip touches at the distance R s from its axis, or at the end of
-    the piece that is nearest to it.
+    On a linear piece of slope s the tip touches at the distance R s from its axis, or at the nearest end of
+    the piece.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)
@@ -129,8 +129,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
     rises = [_continued(part, reach_px, "constant") for part in slopes]
-    # A maximum changes as the piece does on which it stands: the search needs no gradient, for which every
-    # piece would have to be kept.
+    # The gradient of a maximum is that of the touched piece, so the search needs no gradient, which would
+    # keep all pieces in memory.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
         touches = [radius_um * slope for slope in rises]
@@ -153,7 +153,7 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
 
 
 def _middles(rows: Tensor) -> Tensor:
-    """Values (..., x) half a pixel to the right of each: the cubic through four neighbours."""
+    """Values (..., x) half a pixel to the right of each pixel, by a cubic through four neighbours."""
     padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
     middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)
     return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)

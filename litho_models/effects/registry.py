@@ -1,4 +1,4 @@
-"""All effects by name, in the order in which light, resist, developer and microscope act."""
+"""The catalogue: all effects by name, in the order light, resist, developer, microscope."""
 
 from __future__ import annotations
 
@@ -83,14 +83,14 @@ EFFECTS = (
 )
 
 
-# Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
+# In the catalogue, but invisible in a residual map on the layout's grid.
 UNTESTABLE = {
-    "min-to-zero-datum": "an order statistic per scan; what it leaves is carried by datum-offset",
+    "min-to-zero-datum": "an order statistic per scan; datum-offset contains its effect",
     "quantisation": "the raw files are not in the store",
-    "scars-and-spikes": "a mask, not a term: looked for among the outliers",
+    "scars-and-spikes": "a mask, not a term; the loop looks for it among the outliers",
 }
 
-# Those of single scans act in no model.
+# Per-scan effects act in no model.
 _FORWARD_ORDER = (
     *EFFECTS,
     exposure_spot.layer_stacking,
@@ -130,12 +130,12 @@ CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
-    """Add an effect to the catalogue; returns it. From then on it is a candidate of the loop.
+    """Add an effect to the catalogue as a candidate of the loop, and return it.
 
     Args:
-        effect: the effect; one of single scans (``apply`` is ``of_single_scans``) needs a scan term as well,
-            see ``litho_models.scan_terms.register_scan_term``.
-        after: the effect behind which it acts; by default it is the last one of its stage.
+        effect: the effect; a per-scan effect (``apply`` is ``of_single_scans``) also needs a scan term, see
+            ``litho_models.scan_terms.register_scan_term``.
+        after: the effect after which it acts; by default the last one of its stage.
 
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
@@ -167,21 +167,20 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
     """The names sorted as the effects act, from exposure to microscope.
 
     Raises:
-        InputError: a name that is no effect's.
+        InputError: an unknown name.
     """
     given = {get_effect(name).name for name in names}
     known = {**CATALOGUE, **LAWS, **TABLES}
-    # What has no name acts on the finished print, before the microscope sees it.
+    # Laws and tables act on the finished print, before the microscope.
     ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
     return [name for name in ordered if name in given]
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Effects with parameters common to all scans, tested by the score test.
+    """Effects with parameters common to all scans, which screening tests.
 
     Args:
-        tip_radius_um: of the microscope's tip, or the most that it can be, if the store knows it: the tip is
-            tried at that size too.
+        tip_radius_um: radius of the tip or its upper bound, if the store has one, as a further trial size.
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:
@@ -193,7 +192,7 @@ def _tried_at(tip: Effect, radius_um: float) -> Effect:
     limits = tip.parameters["radius_um"]
     radius_um = min(radius_um, limits.upper)
     known = [trial["radius_um"] for trial in tip.trials]
-    # A trial of nearly the same size would say the same twice.
+    # A second trial of nearly the same size would add nothing.
     if any(abs(radius_um - one) < 0.2 * one for one in known):
         return tip
     return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))

@@ -1,4 +1,4 @@
-"""Resist: how dose becomes height, and what shrinks, stays or is lost when it is developed."""
+"""Resist: conversion of dose to height, shrinkage, and gains and losses in development."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Normalised tanh projection about η, identity for α² -> 0 and a step for α² -> inf.
+    """Normalised tanh projection about η: the identity for α² -> 0, a step for α² -> inf.
 
-    With x = H / full height: sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)), which is the
-    quotient of sums of tanh usually printed, and is even and analytic in α.
+    With x = H / full height it is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This equals the usual
+    quotient of sums of tanh and is even and analytic in α.
     """
     full, centre = context.full_height_um, values["centre"]
     relative = height / full
@@ -63,7 +63,7 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H / (1 + q |H|): tall structures grow less than the dose says."""
+    """H / (1 + q |H|): tall structures grow less than in proportion to the dose."""
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
@@ -99,10 +99,10 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(r + s H(r) / full r), r from the centre of the field: tops pull in, more than bases.
+    """H(r + s H(r) / full r), r from the centre of the field: tops shrink inwards more than bases.
 
-    What the mean height pulls is a magnification, which registration has taken out of a scan: what it shows
-    at x is what lies at r = x / (1 + s mean / full).
+    The mean height causes a magnification, which registration removes: a scan shows at x what lies at r = x /
+    (1 + s mean / full).
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -122,7 +122,7 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - φ (H - open_w(H)): what is narrower than w loses a share of its height above its surroundings."""
+    """H - φ (H - open_w(H)): features narrower than w lose a share of their height above the surroundings."""
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
 
@@ -138,9 +138,9 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Closing by a square: whatever is narrower and lower than its surroundings is filled.
+    """Closing by a square: pits narrower than the square are filled.
 
-    A square is an odd number of pixels wide; between two of them the closing is interpolated.
+    Squares are an odd number of pixels wide; other widths are interpolated.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -149,13 +149,13 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:
-    """Closing by a square of 2 half_px + 1 pixels; the field goes on beyond its edge."""
+    """Closing by a square of 2 half_px + 1 pixels; the field is continued beyond its edge."""
     padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
     return -_largest(-_largest(padded, half_px), half_px)
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """The largest value in a square around each pixel that has all of it, one axis after the other."""
+    """The largest value in the square around each pixel whose square lies inside, axis by axis."""
     size = 2 * half_px + 1
     return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
 
@@ -165,7 +165,7 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
     {
         "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
         "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
-        "exponent": Parameter("1", 0.7, 3.0, 2.0, "shape"),
+        "exponent": Parameter("1", 0.7, 4.0, 2.0, "shape"),
         "turn_deg": Parameter("deg", -45.0, 45.0, 0.0, "shape"),
     },
     role="undetermined",
@@ -175,16 +175,19 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
         for turn in (0.0, 45.0)
         for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
     ),
-    source="empirical: loss along a power of the slope, one coefficient per axis of a turned frame",
+    source="empirical: loss along a power of the slope, an ellipse of coefficients in a turned frame",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - cx |dH/dx'|^p - cy |dH/dy'|^p: height missing on slopes, by axis; x' and y' are turned.
+    """H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2): height missing on slopes, by turned axes x', y'.
 
-    p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
+    With cx = cy = c this is c |grad H|^p in any direction. With p = 1 each edge is set back by about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)
-    along_x = rounded_power((turn.cos() * x + turn.sin() * y) ** 2, power)
-    along_y = rounded_power((turn.cos() * y - turn.sin() * x) ** 2, power)
-    return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y
+    along_x, along_y = turn.cos() * x + turn.sin() * y, turn.cos() * y - turn.sin() * x
+    whole = values["along_x_um"] + values["along_y_um"]
+    share_x, share_y = (
+        (values[axis] / whole.clamp(min=1e-12)) ** (2 / power) for axis in ("along_x_um", "along_y_um")
+    )
+    return height - whole * rounded_power(share_x * along_x**2 + share_y * along_y**2, power)

@@ -1,6 +1,6 @@
-"""All models on one dataset under one protocol: trained per fold, scored on scans never seen.
+"""Train and score several models on one dataset, by cross-validation under one protocol.
 
-An interrupted benchmark resumes, and an unchanged fit is never repeated.
+An interrupted benchmark resumes and never repeats an unchanged fit.
 """
 
 import time
@@ -63,7 +63,7 @@ def benchmark(
         out: result folder; ``out/cache`` keeps every fit.
         split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of
             quadrants over all scans; it leaks and is for comparison with the paper only.
-        models: names of models; baselines cost next to nothing.
+        models: names of models.
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         first_folds: fit and score only this many folds, to compare seeds or settings; None for all.
@@ -71,16 +71,16 @@ def benchmark(
         background: by default ``training``, for films ``none``. ``training``: each fit's smooth background,
             learned on its training scans, is added to its predictions; ``shared``: predictions go through the
             measurement model, learned on the same scans with the fit.
-        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
-            the floor is estimated from the held-out residuals of the best model here.
+        noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors. By
+            default the floor is estimated from the held-out residuals of the best model.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: seed of the split, the nuisance blocks and the training.
         workers: local processes that fit and predict; ``dask``: address of a Dask scheduler instead.
 
     Raises:
-        InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
-            the split or for a lock box to open, more first folds than there are, a noise analysis of other
-            data, a damaged cache, or an ``out`` with a benchmark that holds more than this one.
+        InputError: no model, an unknown or repeated one, a store that cannot be read or is too small for the
+            split or the lock box, too many first folds, a noise analysis of other data, a damaged cache, or
+            an ``out`` whose benchmark contains more than this one.
     """
     require_models(models)
     dataset = open_store(store)
@@ -115,7 +115,7 @@ def benchmark(
         ]
         done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
         started = time.monotonic()
-        # Models differ too much for one common estimate: each gives its own, unless the work runs elsewhere.
+        # Models differ too much for a common estimate, so each gives its own, unless the work runs elsewhere.
         of = len(jobs) if places.elsewhere else 0
         for (name, fold, *_), (record, heights) in progress(
             done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of, at_once=workers
@@ -185,7 +185,7 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[PrintedScan]) -> None:
-    """Refuse to replace a benchmark that holds more; one may be made again or extended."""
+    """Refuse to replace a benchmark that contains more; the same one may be repeated or extended."""
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)

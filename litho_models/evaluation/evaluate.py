@@ -1,14 +1,14 @@
-"""One frozen model on a dataset: ``evaluation.json`` and a report."""
+"""Evaluate one frozen model on a dataset: ``evaluation.json`` and a report."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.fit_cache import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen.files import load_frozen
@@ -19,7 +19,6 @@ from litho_models.frozen.on_store import (
     predict_frozen,
     trained_ids,
 )
-from litho_models.prediction.cost import measured_predictions
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import stated_floor
@@ -39,14 +38,13 @@ def evaluate(
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
     open_lock_box: bool = False,
-    device: str = "cpu",
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    A model of these prints, trained on this store or on another one built from the same raw files, is not
-    scored on locked scans unless ``open_lock_box`` asks for it. Locked are the scans that this store locks
-    and those that were locked when the model was made. A model of other prints is scored on all scans. The
-    result says which scans were locked, and whether any of them was scored.
+    If the model was trained on these prints (on this store or another one from the same raw files), locked
+    scans are not scored unless ``open_lock_box`` is set. Scans are locked by this store, or were locked when
+    the model was made. A model of other prints is scored on all scans. The result states which scans were
+    locked, and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -56,7 +54,7 @@ def evaluate(
         background: ``training`` adds the background in the model's card to the predictions (the default), and
             ``none`` does not (the default for films). A card without a background, or with one for fields of
             another size, adds none, and the result says so.
-        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
+        noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors.
         scan_ids: score exactly these scans, even locked ones.
         extrapolate: accept layouts beyond the model's calibrated range.
         open_lock_box: also score the locked scans of the prints that the model was trained on.
@@ -69,7 +67,7 @@ def evaluate(
     film = dataset.instrument == "sem"
     policy, background = policy or usual_policy(film), background or usual_background(film)
     floor = stated_floor(dataset.name, noise)
-    frozen = load_frozen(model, device=device, extrapolate=extrapolate)
+    frozen = load_frozen(model, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Evaluation.FILE_NAME, subject):
@@ -85,10 +83,9 @@ def evaluate(
             raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
         ids = [scan.id for scan in scans]
         learned = card_background(frozen, scans) if background == "training" else None
-        heights, cost = measured_predictions(
-            lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen)
-        )
-        predictions = [Prediction.beside(learned, height) for height in heights]
+        predictions = [
+            Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in progress(scans, "predicting")
+        ]
         protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
         result = Evaluation(
             run=run_info([protocol.seed], len(scans)),
@@ -98,8 +95,6 @@ def evaluate(
                 sha256=frozen.sha256,
                 extrapolated=extrapolate,
                 parameters=frozen.card["parameters"],
-                tiles=tile_consistency(frozen.simulator, scans[0]),
-                cost=cost,
             ),
             split=ScoredSplit(
                 kind="given",

@@ -1,15 +1,15 @@
-"""Where a benchmark keeps its fits: for each its predictions of held-out scans, record and diagnostics.
+"""The cache of a benchmark's fits, with predictions of held-out scans, record and diagnostics.
 
-Each (model, fold) is a folder of its own, named by the hash of everything that decides it.
+Each (model, fold) has its own folder, named by the hash of everything that determines the fit.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.results import Record
@@ -18,8 +18,7 @@ from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import common_geometry, run_key
 from litho_models.models import build_model
-from litho_models.prediction.cost import PredictionCost, measured_predictions
-from litho_models.prediction.tiles import TileDifference, predict_scan, tile_difference
+from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scan_terms.measurement import MeasurementModel
@@ -31,80 +30,28 @@ from litho_models.splits.folds import Fold
 
 
 class FitDiagnostics(Record):
-    """Errors of one fitted model on its own scans and on those held out.
+    """Errors of one fitted model on its training scans and on held-out scans.
 
     All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
     that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
     ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
     """
 
+    # Older results also say what a prediction cost, and how it changes in another crop.
+    model_config = ConfigDict(extra="ignore")
+
     background: Background
     measurement: MeasurementModel | None = None
     training_nm: float
     inner_validation_nm: float | None
     held_out_nm: float
-    tiles: TileDifference | None
-    cost: PredictionCost
-
-
-def diagnose(
-    model: Simulator,
-    scans: Sequence[PrintedScan],
-    validation_ids: Sequence[str],
-    held_out: Sequence[PrintedScan],
-    held_out_um: Sequence[np.ndarray],
-    measured: bool = False,
-) -> FitDiagnostics:
-    """Examine a fitted model.
-
-    Args:
-        model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
-        held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
-        measured: also learn the measurement model from the model's residuals.
-    """
-    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
-
-    def error_nm(chose: bool) -> float:
-        own = [one for one in zip(scans, heights, strict=True) if (one[0].id in validation_ids) == chose]
-        return mean_error_nm([scan for scan, _ in own], [height for _, height in own])
-
-    return FitDiagnostics(
-        background=learn_background(scans, heights),
-        measurement=learn_measurement(scans, heights) if measured else None,
-        training_nm=error_nm(False),
-        inner_validation_nm=error_nm(True) if validation_ids else None,
-        held_out_nm=mean_error_nm(held_out, held_out_um),
-        tiles=tile_consistency(model, held_out[0]),
-        cost=cost,
-    )
-
-
-def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileDifference | None:
-    """Difference of predictions in a scan's field and in a crop of it without a third of rows and columns.
-
-    Pixels closer to the crop's edge than the receptive radius, or than one tile for a model on tiles, are
-    not compared. None for fields too small to leave any pixel, and for models followed by effects.
-    """
-    if not isinstance(model, Simulator):
-        return None
-    border = model.tile.size_px if model.tile is not None else model.reach_px or 0
-    offset = scan.shape[0] // 3, scan.shape[1] // 3
-    if any(length - cut <= 2 * border for length, cut in zip(scan.shape, offset, strict=True)):
-        return None
-    layout = torch.from_numpy(scan.layout_um)[None, None].to(device_of(model))
-    return tile_difference(model, layout, offset, border)
-
-
-def device_of(model: torch.nn.Module) -> str:
-    """The device of a model's weights, as torch names it."""
-    return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
 
 
 _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(Record):
-    """One fit: what it saw and what it cost; errors in nm, None if the model has no rounds.
+    """The record of one fit: scans, cost and errors in nm; None for a model without training steps.
 
     ``at_bounds`` maps each fitted value on a bound of its range to that bound.
     """
@@ -127,14 +74,14 @@ class FitRecord(Record):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """One fit and its heights (ny, nx) of the held-out scans, µm; fitted only if it is not in the cache.
+    """Return a fit and its heights (ny, nx) of the held-out scans, µm, from the cache or newly fitted.
 
     Args:
-        measured: learn the measurement model from a first fit, fit again to the training scans freed of it,
-            and learn it again from the second fit.
+        measured: learn the measurement model from a first fit, remove it from the training scans, fit again,
+            and learn the measurement model again.
 
     Raises:
-        InputError: a kept fit that cannot be read.
+        InputError: a cached fit that cannot be read.
     """
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
@@ -150,7 +97,7 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Training scans freed of the measurement model that is learned with this model's predictions."""
+    """Training scans without the measurement model that is learned from this model's predictions."""
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -159,7 +106,7 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """What a fit expects of a scan: the print (ny, nx), µm, and what its training scans have in common."""
+    """The expected scan: the print (ny, nx), µm, and what the training scans share."""
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)
@@ -186,25 +133,36 @@ def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
 
 
 def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool) -> None:
-    heights = [predict_scan(fitted.model, scan) for scan in fold.held_out]
+    model, chose = fitted.model, fitted.validation_ids
+    held_out = [predict_scan(model, scan) for scan in fold.held_out]
+    own = [predict_scan(model, scan) for scan in progress(fold.training, "predicting")]
+
+    def error_nm(chosen_on: bool) -> float:
+        pairs = [pair for pair in zip(fold.training, own, strict=True) if (pair[0].id in chose) == chosen_on]
+        return mean_error_nm([scan for scan, _ in pairs], [height for _, height in pairs])
+
     record = FitRecord(
-        model=fitted.model.name,
+        model=model.name,
         fold=fold.number,
         key=key,
         training_ids=fitted.training_ids,
-        validation_ids=fitted.validation_ids,
+        validation_ids=chose,
         held_out_ids=[scan.id for scan in fold.held_out],
-        parameters=fitted.model.parameter_count,
+        parameters=model.parameter_count,
         seconds=fitted.seconds,
         steps=[entry.step for entry in fitted.history],
-        at_bounds=fitted.model.at_bounds,
+        at_bounds=model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
-        diagnostics=diagnose(
-            fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights, measured
+        diagnostics=FitDiagnostics(
+            background=learn_background(fold.training, own),
+            measurement=learn_measurement(fold.training, own) if measured else None,
+            training_nm=error_nm(False),
+            inner_validation_nm=error_nm(True) if chose else None,
+            held_out_nm=mean_error_nm(fold.held_out, held_out),
         ),
     )
     with atomic_folder(folder) as temporary:
-        for number, height in enumerate(heights):
+        for number, height in enumerate(held_out):
             np.save(temporary / _PREDICTION.format(number), height)
         (temporary / _FIT).write_text(record.model_dump_json(indent=1), encoding="utf-8")

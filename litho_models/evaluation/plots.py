@@ -16,11 +16,8 @@ from litho_models.scoring.records import ModelScores
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from litho_models.evaluation.fit_cache import FitRecord
-
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
-_SD_95 = 1.96
 # Maps a row of a model to x and one or two y.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
@@ -142,13 +139,6 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
     return figure
 
 
-def loss_curves(fits: Sequence[FitRecord]) -> Figure:
-    """Training error (solid) and inner-validation error (dashed) of every fit with rounds."""
-    label = "MAE, nm (solid: training, nuisances removed;\ndashed: inner validation, datum-free)"
-    lines: Lines = lambda fit: [fit.steps, fit.training_mae_nm, fit.validation_mae_datum_free_nm]  # noqa: E731
-    return _curves(fits, "optimiser steps", {label: lines})
-
-
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
     """A panel for each label, a colour for each model: x, then a solid and perhaps a dashed line."""
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
@@ -162,23 +152,4 @@ def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> F
     handles, names = grid[0].get_legend_handles_labels()
     named = dict(zip(names, handles, strict=True))
     grid[0].legend(named.values(), named, fontsize=8)
-    return figure
-
-
-def print_gains(score: ModelScores) -> Figure:
-    """Gain and offset of every scan against a model's prediction with 95 % intervals, coloured by print."""
-    figure = new_figure(7.0, 5.0)
-    axes = figure.subplots()
-    for name in sorted({row.print for row in score.scans}):
-        rows = [row for row in score.scans if row.print == name]
-        figures = [(r.slope, r.intercept_nm, r.slope_error, r.intercept_error_nm) for r in rows]
-        gain, offset, of_gain, of_offset = np.array(figures, float).T
-        axes.errorbar(gain, offset, _SD_95 * of_offset, _SD_95 * of_gain, fmt=".", lw=0.8, label=name)
-    axes.axvline(1.0, color="#9aa7b5", lw=0.8)
-    axes.axhline(0.0, color="#9aa7b5", lw=0.8)
-    axes.set(
-        xlabel=f"gain: measured height per height predicted by {score.model}",
-        ylabel="offset at predicted height zero, nm",
-    )
-    axes.legend(title="print", fontsize=8)
     return figure

@@ -15,10 +15,9 @@ from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
 _WORDS = Path(__file__).with_name("words.toml")
-_OF_PREDICTION = ("tiles_max_nm", "tiles_rms_nm", "cost_seconds_per_scan", "cost_peak_memory_mib")
 _OF_FIT = (
-    *("diagnostics_training_nm", "diagnostics_inner_validation_nm", "diagnostics_held_out_nm"),
-    *("parameters", "seconds"),
+    *("model", "fold", "diagnostics_training_nm", "diagnostics_inner_validation_nm"),
+    *("diagnostics_held_out_nm", "parameters", "seconds"),
 )
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
@@ -45,12 +44,6 @@ def write_evaluation_report(
     worst = int(np.nanargmax(list(scores.leading_of_scans_nm.values())))
     _one_scan(page, "The worst scan", scans[worst], {scores.model: predictions_um[worst]}, result.nuisance)
     _numbers(page, result, [scores])
-    page.table(
-        [result.model],
-        "How the same pixels change in another crop; what predicting a scan cost on this machine.",
-        "model.csv",
-        columns=("name", "parameters", *_OF_PREDICTION),
-    )
     return page.write(out)
 
 
@@ -90,24 +83,15 @@ def write_benchmark_report(
     middle = scans[int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])]
     shown = {s.model: predictions_um[s.model][middle.id] for s in scores}
     _one_scan(page, "The scan of median error", middle, shown, result.nuisance)
-    page.heading("Gain and offset of single prints", folded=True)
-    page.figure(
-        plots.print_gains(best),
-        f"Line through measured against predicted height ({best.model}, nothing fitted to the scan before); "
-        "95 % intervals from blocks of 32 px. Numbers in scans.csv.",
-    )
     page.heading("Training", folded=True)
     page.table(
         result.fits,
         "Every fit: error on its training, inner-validation and held-out scans, all without a background and "
-        "with the zero height of each scan fitted, so that over-fitting shows; the largest and the RMS "
-        "difference of the same pixels in another crop; what training and predicting cost here.",
+        "with the zero height of each scan fitted, so that over-fitting shows; how long training took here.",
         "fits.csv",
         digits=3,
-        columns=("model", "fold", *_OF_FIT, *(f"diagnostics_{name}" for name in _OF_PREDICTION)),
+        columns=_OF_FIT,
     )
-    if curves := [fit for fit in result.fits if len(fit.steps) > 1]:
-        page.figure(plots.loss_curves(curves), "Error during training.")
     _numbers(page, result, scores)
     return page.write(out)
 
@@ -157,11 +141,6 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
     page.heading("By level and frequency", folded=True)
     page.figure(plots.level_bias(scores), "Error by printed level.")
     page.figure(plots.transfer(scores), "Transfer, coherence and error by spatial frequency.")
-    page.table(
-        tables.band_table(scores),
-        "How far up in frequency the prediction follows the measurement, cycles/µm.",
-        "bands.csv",
-    )
     page.heading("By scan and by level", folded=True)
     page.table(tables.scan_table(scores), "By scan.", "scans.csv")
     page.table(tables.level_table(scores), "By level.", "levels.csv")

@@ -1,4 +1,4 @@
-"""``evaluation.json`` of one frozen model, ``benchmark.json`` of many fits, and two of them side by side."""
+"""The records ``evaluation.json`` and ``benchmark.json``, and the comparison of two of them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import read_text
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
 from litho_models.evaluation.fit_cache import FitRecord
-from litho_models.prediction.cost import PredictionCost
-from litho_models.prediction.tiles import TileDifference
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, Paired, paired_scores
@@ -26,14 +25,12 @@ if TYPE_CHECKING:
 
 
 class ModelRecord(Record):
-    """The frozen model that was scored, and what its predictions cost."""
+    """The frozen model that was scored."""
 
     name: str
     sha256: str
     extrapolated: bool
     parameters: int | None = None
-    tiles: TileDifference | None = None
-    cost: PredictionCost | None = None
 
 
 class Evaluation(Result):
@@ -72,7 +69,7 @@ class Benchmark(Result):
 
 @dataclass(frozen=True)
 class ScoredResult:
-    """What two results must agree on to be compared, and their scores by model."""
+    """The facts that two results must share to be compared, and their scores by model."""
 
     path: Path
     protocol: dict[str, object]
@@ -86,8 +83,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     difference means that the first is better.
 
     Raises:
-        InputError: files that cannot be read, different data, folds, scans or nuisances, or a model that
-            was trained on scored scans beside one that was not.
+        InputError: files that cannot be read; different data, folds, scans or nuisances; or a model that was
+            trained on scored scans, compared with one that was not.
     """
     import pandas as pd
 
@@ -113,7 +110,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def read_scored(path: str | Path) -> ScoredResult:
-    """Read a benchmark or an evaluation; of a folder, the result inside it.
+    """Read a benchmark or an evaluation, from its file or folder.
 
     Raises:
         InputError: neither of the two.
@@ -138,7 +135,7 @@ def read_scored(path: str | Path) -> ScoredResult:
 
 def _schema(file: Path) -> object:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_text(file))
     except (OSError, ValueError):
         return None
     return content.get("schema") if isinstance(content, dict) else None
@@ -161,6 +158,6 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """A hash by its first digits, which are enough to see that it differs."""
+    """The first digits of a hash, which are enough to show a difference."""
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

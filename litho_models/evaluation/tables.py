@@ -22,7 +22,7 @@ Rows = list[dict[str, Any]]
 def headline_table(
     scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
 ) -> pd.DataFrame:
-    """One row per model: both errors with intervals, their excess over the noise floor, spread and bias.
+    """One row per model, with both errors and their intervals, excess over the noise floor, spread and bias.
 
     The last row is the floor itself, in each column for the scan terms of that column. Films have errors of
     edges and features instead.
@@ -109,12 +109,6 @@ def metric_table(scores: Sequence[ModelScores]) -> Rows:
     ]
 
 
-def band_table(scores: Sequence[ModelScores]) -> Rows:
-    """One row per model: how far up in frequency the prediction follows the measurement, along x and y."""
-    names = [f"{figure}_{axis}_per_um" for figure in ("half_power", "noise_band") for axis in "xy"]
-    return [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
-
-
 def scan_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model and scan."""
     return [
@@ -136,12 +130,12 @@ def level_table(scores: Sequence[ModelScores]) -> Rows:
 
 
 def interval_text(interval: Interval) -> str:
-    """An interval for people."""
+    """Format an interval."""
     return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
 
 
 def metric_text() -> str:
-    """What the columns of ``metric_table`` are."""
+    """Explain the columns of ``metric_table``."""
     return (
         f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
         f"(index step {INDEX_STEP:g}). {metrics_text()}"

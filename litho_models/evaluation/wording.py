@@ -1,4 +1,4 @@
-"""Results in words, from templates: verdicts, how errors were made, and what limits them."""
+"""Describe results in words, from templates: verdicts, protocol and limits."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Which model predicts best, by how much, whether that is more than chance, and how much is noise.
+    """State which model predicts best, by how much, whether that is more than chance, and the noise.
 
-    A difference is judged over prints where there are several.
+    A difference is judged over prints if there are several.
     """
     best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
     assert best is not None
@@ -23,7 +23,7 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """How far the model is off on scans, how much of that is the zero height, and how much is noise."""
+    """State the error of the model, its part from the zero height, and the noise."""
     return _verdict(result, result.scores)
 
 

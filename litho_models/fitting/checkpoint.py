@@ -1,25 +1,24 @@
-"""What a killed run needs to go on: weights, optimiser moments, the best weights, the history."""
+"""Checkpoints of a training: weights, optimiser moments, best weights, history."""
 
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.results import Record
 from litho_models.simulator import Simulator
 
 
-class RoundRecord(BaseModel):
-    """One round of training; the validation error is None where no scans were set aside."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class RoundRecord(Record):
+    """One round of training; the validation error is None without validation scans."""
 
     step: int
     training_mae_nm: float
@@ -27,14 +26,14 @@ class RoundRecord(BaseModel):
     seconds: float
 
 
+@dataclass
 class TrainingState:
-    """The model, its optimiser, and the best weights so far."""
+    """The model, its optimiser, the rounds so far, and the best weights."""
 
-    def __init__(self, model: Simulator, optimiser: torch.optim.Optimizer):
-        self.model = model
-        self.optimiser = optimiser
-        self.history: list[RoundRecord] = []
-        self.best: dict[str, Tensor] = {}
+    model: Simulator
+    optimiser: torch.optim.Optimizer
+    history: list[RoundRecord] = field(default_factory=list)
+    best: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def step(self) -> int:
@@ -61,7 +60,9 @@ class TrainingState:
         file.write_bytes(buffer.getvalue())
 
     def load(self, file: Path, history: list[RoundRecord]) -> None:
-        """The inverse of ``save``; the file can hold tensors and numbers only, and nothing in it is run."""
+        """The inverse of ``save``. The file can contain only tensors and numbers, and nothing in it is
+        run.
+        """
         weights, self.best, moments = torch.load(file, map_location="cpu", weights_only=True)
         self.model.load_state_dict(weights)
         self.optimiser.load_state_dict(moments)
@@ -70,10 +71,10 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Read what an earlier call kept in ``folder``, whose files appear whole or not at all.
+    """Read the files of an earlier call in ``folder``, which are always written as a whole.
 
     Raises:
-        InputError: a file is missing or was damaged since.
+        InputError: a missing or damaged file.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""How a model is trained: one frozen, explicit record, saved with every run."""
+"""The settings of a training: a frozen, explicit record that every run saves."""
 
 from typing import Any, Literal, Self, get_args
 
@@ -12,18 +12,18 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
-# In a default PBL the steps train only the chain, which the feature networks then correct: a short training
-# is enough, and no scan is spent on choosing between its rounds.
+# In a default PBL the steps train only the chain, which the feature networks then correct. A short training
+# is enough, and no scan is needed to choose between rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
-# What a fit by least squares depends on.
+# Settings that a fit by least squares depends on.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance", "free_gain"}
-# Upper limit of all counts: no real case needs more, and beyond it sums lose digits or overflow.
+# Upper limit of all counts. No real case needs more, and larger sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
 class TrainingConfig(BaseModel):
-    """Settings of one fit. A model that is fitted by least squares uses the seed and nuisances only.
+    """Settings of one fit. Fits by least squares use only the seed and the nuisances.
 
     ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), their
     offset and gain pinned to a mean of zero over the training scans.
@@ -95,7 +95,8 @@ class TrainingConfig(BaseModel):
     def takes_steps(self, model: Simulator) -> bool:
         """Whether the model is trained by stochastic gradient rather than by least squares.
 
-        Large models are, unless they are linear in their parameters; small ones only if the paper does so.
+        Large models are, unless they are linear in their parameters; small models are only in the paper's
+        recipe.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)

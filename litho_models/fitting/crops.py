@@ -1,4 +1,4 @@
-"""Crops of scans with their surroundings: which ones, and how they are cut."""
+"""Choose crops of scans, and cut them with their surroundings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,19 +10,18 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# For its gradient a network keeps hundreds of bytes per pixel of a crop.
+# Pixels per pass, because a network keeps hundreds of bytes per pixel for its gradient.
 _PASS_PX = 256**2
 
 
 @dataclass(frozen=True)
 class Window:
-    """A square of ``size_px`` pixels of scan number ``scan`` with its corner at (y, x); flips are (y, x)."""
+    """A square of ``size_px`` pixels of scan number ``scan`` with its corner at (y, x)."""
 
     scan: int
     y: int
     x: int
     size_px: int
-    flip: tuple[bool, bool] = (False, False)
 
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
@@ -30,16 +29,11 @@ def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
     (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
     ny, nx = field.shape
     if min(top, left) >= 0 and top + size <= ny and left + size <= nx:
-        cropped = field[top : top + size, left : left + size]
-    else:
-        rows, columns = (
-            np.clip(np.arange(start, start + size), 0, length - 1)
-            for start, length in ((top, ny), (left, nx))
-        )
-        cropped = field[np.ix_(rows, columns)]
-    if window.flip[0]:
-        cropped = cropped[::-1]
-    return cropped[:, ::-1] if window.flip[1] else cropped
+        return field[top : top + size, left : left + size]
+    rows, columns = (
+        np.clip(np.arange(start, start + size), 0, length - 1) for start, length in ((top, ny), (left, nx))
+    )
+    return field[np.ix_(rows, columns)]
 
 
 def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
@@ -49,7 +43,7 @@ def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: in
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """The windows of one optimiser step; a function of seed and step, so a resumed run sees the same."""
+    """The windows of one optimiser step, which depend only on seed and step, so resumed runs are equal."""
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
     random = np.random.default_rng([config.seed, step])

@@ -1,4 +1,4 @@
-"""Fit any model to printed scans: the one entry that commands, benchmark and loop call."""
+"""Fit any model to printed scans, for commands, benchmark and loop."""
 
 import time
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# Fitted in closed form and close to the data: it gives a network its first scan terms.
+# A model in closed form that is close to the data, for a network's first scan terms.
 FIRST_MODEL = "linear"
 
 
@@ -79,7 +79,7 @@ def fit_with_record(
             f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
         )
     model = build_model(model_name, config.variant, **geometry, **fields)
-    # Checked even for a model that writes no checkpoint: the folder may hold another model's.
+    # Checked even if the model writes no checkpoint, because the folder may contain another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
@@ -132,7 +132,7 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
 def run_key(
     model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
 ) -> str:
-    """Hash of all that decides a fit: model, hyper-parameters, settings, the scans, and what it predicts."""
+    """Hash of everything that determines a fit: model, hyper-parameters, settings, scans, predicted scans."""
     record = {
         "held_out_ids": list(held_out_ids),
         "model": model.name,

@@ -1,8 +1,8 @@
 """Least squares for all small models: damped Gauss-Newton that also solves for the terms of single scans.
 
-The loss is a sum of squares, or of absolute values by reweighting: weights 1/sqrt(r² + δ²) turn squares into
-absolute values. The problem supplies what is fitted (a model of the zoo, or the loop's model with effects),
-its derivatives, and the ``room`` in which the parameters may move.
+The loss is a sum of squares, or of absolute values by the weights 1/sqrt(r² + δ²). The problem provides
+residuals and derivatives (of a model of the zoo, or of the loop's model with effects), and the ``room`` in
+which the parameters may move.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from litho_data.foundation.kinds import Array
 Loss = Literal["absolute", "squares"]
 Room = tuple[Array, Array]
 
-# Residuals below this count squared: far below the noise of a print (16 nm).
+# Residuals below this count squared; it is far below the noise of a print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
 # Squared size below which a combination of unit columns is round-off.
@@ -34,7 +34,7 @@ class Linearised:
     Attributes:
         residual: measured minus predicted, (n,).
         jacobian: derivatives of the prediction, (p, n).
-        basis: what the scan may add by itself, (k, n).
+        basis: free terms of the scan, (k, n).
     """
 
     residual: Array
@@ -43,7 +43,7 @@ class Linearised:
 
 
 class Problem(Protocol):
-    """What is fitted, scan by scan."""
+    """The interface of a fit, scan by scan."""
 
     def linearise(self, vector: Array) -> list[Linearised]:
         """All scans at these parameters."""
@@ -57,16 +57,16 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class Rules:
-    """How a fit is made.
+    """Settings of a fit.
 
     Attributes:
         loss: what is minimised.
-        term_weight: with ``squares``, weight of residuals that the scans' own terms can explain: enough to
-            fix what only these terms carry (the common datum), too little for a scan to pull the parameters.
+        term_weight: with ``squares``, weight of residuals that scan terms can explain. It is large enough to
+            determine their common part (the datum) and too small for a scan to bias the parameters.
         pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
         steps: largest number of steps; ``relative_gain``: a smaller gain of one step ends the fit.
         tries: attempts at one step, each with ten times the damping; ``lowest_damping``: its lower limit.
-        kept_above: derivatives are kept while a step gains this share of what they promise; None: never.
+        kept_above: derivatives are reused while a step gains this share of the predicted gain; None: never.
     """
 
     loss: Loss
@@ -118,7 +118,7 @@ def fit_least_squares(
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
         small = gained < rules.relative_gain * loss
-        # Only derivatives computed at this point can show that no larger step is left.
+        # Only derivatives at this point can show convergence.
         ends = small and fresh
         if rules.kept_above is None:
             kept = False
@@ -182,7 +182,7 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # The best terms for the step as it is taken, not as it was asked for.
+        # The best terms for the limited step, not for the unlimited one.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -202,7 +202,7 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """By how much a step (p,) lowers the squares of normal equations (p, p), (p,), if these are exact."""
+    """Predicted decrease of the squares by a step (p,), from normal equations (p, p), (p,)."""
     return float(2 * right @ step - step @ matrix @ step)
 
 
@@ -235,8 +235,8 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
     """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
 
-    If a step were cut to its bounds afterwards, the other parameters would still fit the uncut step, and a
-    fit whose optimum lies on a bound would creep; minimised inside the box, they adapt.
+    If a step were cut to its bounds afterwards, the other parameters would still fit the uncut step, and fits
+    with an optimum on a bound would converge slowly.
 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).

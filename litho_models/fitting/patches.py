@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -12,8 +12,6 @@ from torch.utils.data import Dataset
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.fitting.crops import Window, cut
-
-Flips = Literal["none", "y", "x", "both"]
 
 
 class Patch(TypedDict):
@@ -32,17 +30,15 @@ class PatchDataset(Dataset[Patch]):
 
     ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
     sees what lies beyond its edge; ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid``
-    (1, s, s) bool says where it counts. Patches are never turned by 90°: scan lines and written lines have a
-    direction, and the two axes of a print are not alike. A flip reverses what acts to one side, such as a
-    lag of the beam or of the microscope, so none is made unless asked for.
+    (1, s, s) bool says where it counts. Patches are neither turned nor flipped: the two axes of a print are
+    not alike, and a lag of the beam or of the microscope acts to one side.
 
     Args:
         store: dataset store or its path. Locked scans are left out.
         size_px: side s of a patch; ``margin_px``: m.
         per_scan: number of patches from each scan.
         ids: scans to draw from; all that are not locked by default.
-        flips: axes along which half of the patches are reversed, at random.
-        seed: decides places and flips.
+        seed: decides the places.
 
     Raises:
         InputError: unknown or locked ids, or a patch that is larger than a scan.
@@ -56,11 +52,9 @@ class PatchDataset(Dataset[Patch]):
         margin_px: int = 32,
         per_scan: int = 64,
         ids: Sequence[str] | None = None,
-        flips: Flips = "none",
         seed: int = 0,
     ):
-        opened = store if isinstance(store, Store) else open_store(store)
-        self._scans = _chosen(opened, ids)
+        self._scans = _chosen(store if isinstance(store, Store) else open_store(store), ids)
         self._layouts_um = [scan.layout_um for scan in self._scans]
         smallest = min(min(scan.shape) for scan in self._scans)
         if not 1 <= size_px <= smallest:
@@ -68,8 +62,7 @@ class PatchDataset(Dataset[Patch]):
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
             raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one per scan")
-        self.size_px, self.margin_px, self.per_scan = size_px, margin_px, per_scan
-        self.flips, self.seed = flips, seed
+        self.size_px, self.margin_px, self.per_scan, self.seed = size_px, margin_px, per_scan, seed
 
     @property
     def ids(self) -> list[str]:
@@ -85,11 +78,8 @@ class PatchDataset(Dataset[Patch]):
         number = index // self.per_scan
         scan, random = self._scans[number], np.random.default_rng([self.seed, index])
         y, x = (int(random.integers(length - self.size_px + 1)) for length in scan.shape)
-        along_y, along_x = (bool(drawn) for drawn in random.integers(2, size=2))
-        flip = (along_y and self.flips in ("y", "both"), along_x and self.flips in ("x", "both"))
-        window = Window(number, y, x, self.size_px, flip)
-        height_um = cut(scan.height_um, window)
-        valid = cut(scan.valid, window) & np.isfinite(height_um)
+        window = Window(number, y, x, self.size_px)
+        height_um, valid = cut(scan.height_um, window), cut(scan.usable, window)
         return Patch(
             layout_um=_tensor(cut(self._layouts_um[number], window, self.margin_px), np.float32),
             height_um=_tensor(np.where(valid, height_um, 0), np.float32),
@@ -97,12 +87,6 @@ class PatchDataset(Dataset[Patch]):
             scan=scan.id,
             y_px=y,
             x_px=x,
-        )
-
-    def __repr__(self) -> str:
-        return (
-            f"<PatchDataset: {len(self):,} patches of {self.size_px} px with {self.margin_px} px around, "
-            f"from {len(self._scans)} scans>"
         )
 
 
@@ -117,5 +101,5 @@ def _chosen(store: Store, ids: Sequence[str] | None) -> list[PrintedScan]:
     return wanted
 
 
-def _tensor(field: np.ndarray, dtype: type) -> Tensor:
+def _tensor(field: np.ndarray, dtype: type[Any]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(field[None], dtype=dtype))

@@ -23,7 +23,7 @@ from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 # Fitted pixels of all scans together, on a square grid in each: 100 MB of features.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
-# Passes over all pixels after which the terms of the scans are estimated anew.
+# Passes over all pixels between estimates of the scan terms.
 EPOCHS_PER_ROUND = 2
 
 
@@ -95,7 +95,7 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """What the networks should add at all pixels, (all n,) µm, the terms of the scans removed."""
+    """Targets of the networks at all pixels, (all n,) µm, without the scan terms."""
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]
     own = np.array([least_squares(part.terms, rest) for part, rest in zip(parts, rests, strict=True)])

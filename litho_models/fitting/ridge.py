@@ -1,4 +1,4 @@
-"""Models that are linear in many features: ridge regression in closed form, one scan in memory at a time."""
+"""Fit models that are linear in many features by ridge regression, with one scan in memory at a time."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ TILE_PX = 512
 KEPT_BYTES = 2**31
 # The first pass minimises squares; the second reweights them to absolute values, so that blobs weigh little.
 PASSES = 2
-# Weight of the scans' own terms: fixes what only these terms carry, the common datum.
+# Weight of the scan terms, which determines the common datum.
 _TERM_WEIGHT = 1e-3
 
 
@@ -33,8 +33,8 @@ def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy, fre
     """Fit the weights of ``model`` in place to the mean absolute error.
 
     Args:
-        model: the model; ``scans``: what it is fitted to.
-        policy: what each scan may add by itself; offsets of lines are left out, as they average out.
+        model: the model; ``scans``: training scans.
+        policy: free terms of each scan, without line offsets, which average out.
     """
     terms = smooth_training_terms(policy, free_gain)
     if isinstance(model, RandomFeatures):

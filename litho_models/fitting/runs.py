@@ -1,6 +1,5 @@
 """Run folders: train a model on a store, resumable."""
 
-import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,7 +12,6 @@ from litho_data.commands.progress import say
 from litho_data.commands.settings import refused
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import require_known
-from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
@@ -22,6 +20,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
+from litho_models.fitting.processes import processes_of_torchrun
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.models import model_class
@@ -34,7 +33,7 @@ CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(Result):
-    """``run.json``: what was trained, on what, and how it went."""
+    """``run.json``: the record of a training."""
 
     SCHEMA: ClassVar[str] = "litho-models/run/1"
     FILE_NAME: ClassVar[str] = "run.json"
@@ -64,7 +63,8 @@ def train(
 ) -> TrainingRun:
     """Train a model on a store into a run folder; the same call again continues a killed run.
 
-    The scans of the lock box are left out unless ``use_lock_box``.
+    The scans of the lock box are left out unless ``use_lock_box``. Under ``torchrun`` the processes share
+    each step, and the first one writes.
 
     Args:
         store: dataset store; ``model``: name of a model; ``out``: run folder.
@@ -87,9 +87,10 @@ def train(
         "config": config.model_dump(mode="json"),
         "lock_box": locked,
     }
-    # Under torchrun only the first process writes.
-    first = int(os.environ.get("RANK", "0")) == 0
-    with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
+    with (
+        processes_of_torchrun() as first,
+        growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext(),
+    ):
         if first:
             say(f"training {model} on {len(used)} scans")
         fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
@@ -129,13 +130,12 @@ def train(
             },
             limitations=["Not evaluated yet: see the evaluation of this model for its error."],
         )
-        _write_history(record, folder)
         record.write(folder)
     return record
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """The checked settings of a recipe; those that training does not know go to the model.
+    """The checked settings of a recipe; settings unknown to training go to the model.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.
@@ -166,10 +166,3 @@ def step_share(scans: Sequence[PrintedScan]) -> list[float]:
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )
     return (np.bincount(steps, minlength=scans[0].levels) / steps.size).tolist()
-
-
-def _write_history(record: TrainingRun, folder: Path) -> None:
-    import pandas as pd
-
-    with atomic_file(folder / "history.csv") as temporary:
-        pd.DataFrame([entry.model_dump() for entry in record.history]).to_csv(temporary, index=False)

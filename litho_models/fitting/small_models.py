@@ -1,4 +1,4 @@
-"""Small models of the zoo fitted to printed scans: a window of each, derivatives in forward mode."""
+"""Fit small models of the zoo to a window of each scan, with derivatives in forward mode."""
 
 import copy
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from litho_models.simulator import Simulator
 # A quarter of each scan is enough for a small model; the quadrant changes from scan to scan.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Parameters are heights in µm and raw numbers of ranges: a step of more than one unit would leave the
-# region in which the linearisation is valid.
+# Largest step. Parameters are heights in µm and raw numbers of ranges, for which larger steps leave the
+# region of a valid linearisation.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
@@ -51,7 +51,7 @@ class ModelProblem:
     """A model on windows of scans; it works on its own copy of the model.
 
     Args:
-        model: the model; ``scans``: what it is fitted to; ``terms``: what each may add.
+        model: the model; ``scans``: training scans; ``terms``: free terms of each scan.
     """
 
     def __init__(self, model: Simulator, scans: Sequence[PrintedScan], terms: Terms):

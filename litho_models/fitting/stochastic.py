@@ -1,39 +1,35 @@
-"""Models with many parameters: stochastic gradient on random crops, in rounds.
+"""Train models with many parameters by stochastic gradient on random crops, in rounds.
 
-Between rounds the scan terms are estimated anew from whole-scan predictions, the inner
-validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
-that is random is a function of seed and step, so a killed run continues to the same result.
+Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
+scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
+and step, so an interrupted run continues to the same result. Processes share the crops of each step and add
+their gradients. Between rounds each process does the same.
 """
 
-from __future__ import annotations
-
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
+from litho_models.fitting.processes import add_over_processes, own_device, rank_and_count
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
 from litho_models.scoring.metrics import mean_error_nm
 from litho_models.simulator import Simulator
-
-if TYPE_CHECKING:
-    from lightning.fabric import Fabric
 
 WARM_UP_FRACTION = 0.1
 FIRST_RATE, LAST_RATE = 0.1, 1e-3
@@ -47,20 +43,18 @@ def train_network(
     first_predictions_um: Callable[[], Sequence[np.ndarray]],
     checkpoints: CheckpointFolder | None = None,
 ) -> list[RoundRecord]:
-    """Train ``model`` in place; it ends with the weights of the best round on ``validation``.
+    """Train ``model`` in place, on a GPU if there is one; it ends with the weights of the best round.
 
-    Without validation scans the last round counts. ``first_predictions_um`` makes the
-    heights of a small model on the training scans, from which the first scan terms are estimated; a run
-    that continues does not call it.
+    The best round is that with the smallest error on ``validation``, without validation scans the last one.
+    ``first_predictions_um`` makes the heights of a small model on the training scans, from which the first
+    scan terms are estimated; a run that continues does not call it.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
-    fabric = _fabric()
-    optimiser = _optimiser(model, config)
-    heights = _Heights(model, config)
-    warn_where_slower(heights.precision, fabric.device.type)
-    module, optimiser = fabric.setup(heights, optimiser)
-    state = TrainingState(model, optimiser)
+    device = own_device()
+    warn_where_slower(_precision(config), device.type)
+    model.to(device)
+    state = TrainingState(model, _optimiser(model, config))
     if checkpoints is not None:
         checkpoints.load(state)
     bounds = np.linspace(0, config.steps, config.rounds + 1).astype(int)
@@ -79,27 +73,27 @@ def train_network(
         what = f"training {model.name} to step {config.steps}"
         with _diverging(model, last):
             for step in progress(range(first, last), what, estimate_of=left):
-                sums.append(_step(fabric, module, optimiser, targets, config, step))
-        absolute, counted = torch.stack(sums).double().cpu().numpy().T
+                sums.append(_step(state, targets, config, step, device))
+        absolute, counted = torch.stack(sums).cpu().double().numpy().T
         record = RoundRecord(
             step=last,
             training_mae_nm=NM_PER_UM * float(np.mean(absolute / counted)),
             validation_mae_datum_free_nm=validation_error(model, validation),
             seconds=time.monotonic() - started,
         )
-        if not np.isfinite([record.training_mae_nm, record.validation_mae_datum_free_nm or 0]).all():
+        errors_nm = record.training_mae_nm, record.validation_mae_datum_free_nm or 0.0
+        if not HEIGHT_UM.holds([one / NM_PER_UM for one in errors_nm]):
             raise _diverged(model, last)
         state.record(record)
-        if checkpoints is not None and fabric.is_global_zero:
+        if checkpoints is not None and rank_and_count()[0] == 0:
             checkpoints.save(state)
-        fabric.barrier()
     state.restore_best()
     return state.history
 
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Run steps up to ``last``; InputError if numbers become infinite or NaN, whatever fails then."""
+    """Run steps up to ``last``; raise InputError if numbers become infinite or NaN."""
     try:
         yield
         error = None
@@ -114,7 +108,7 @@ def _diverging(model: Simulator, last: int) -> Iterator[None]:
 def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
-        got=f"weights or errors that are not finite at step {step}",
+        got=f"weights or errors beyond all heights at step {step}",
         wanted="steps that converge",
         hint="try a smaller learning_rate",
     )
@@ -137,84 +131,69 @@ class _Targets:
         self.heights_um = [np.pad(height, overhang_px) for height in heights]
 
 
-class _Heights(nn.Module):
-    """Heights of crops for training, as one module, because processes share the gradients of one module.
-
-    Random crops come with their surroundings (``margin_px``) or are one tile of the model; quadrants are
-    images of their own. Layouts and heights are float32 whatever the precision within.
-    """
-
-    def __init__(self, model: Simulator, config: TrainingConfig):
-        super().__init__()
-        self.model = model
-        random = config.crops == "random"
-        self.tile = model.tile if random else None
-        self._inside = random and (model.reach_px is not None or model.tile is not None)
-        self.precision: Precision = "bfloat16" if config.precision == "bf16-mixed" else "float32"
-
-    @property
-    def margin_px(self) -> int:
-        """Pixels around a crop; they change in training if a blur learns its width."""
-        return (self.model.reach_px or 0) if self._inside else 0
-
-    def forward(self, layout_um: Tensor) -> Tensor:
-        predict = self.model.interior if self._inside else self.model
-        with network_precision(self.precision, layout_um.device.type):
-            return predict(layout_um).float()
-
-
 def _step(
-    fabric: Fabric,
-    module: _Heights,
-    optimiser: torch.optim.Optimizer,
-    targets: _Targets,
-    config: TrainingConfig,
-    step: int,
+    state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
     """Do one step; return (2,): weighted absolute error, µm, and weight; a GPU may still be computing it."""
-    for group in optimiser.param_groups:
+    for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
-    own = batch[fabric.global_rank :: fabric.world_size]
-    # A process without a crop of its own joins the sum of gradients with one of weight 0.
-    passes = in_passes(own or batch[:1], fabric.device)
-    optimiser.zero_grad(set_to_none=True)
-    sums = torch.zeros(2, device=fabric.device)
-    for number, some in enumerate(passes, 1):
-        # The mean over processes is the mean over the crops of the batch, however they are dealt.
-        share = len(some) * fabric.world_size / len(batch) if own else 0.0
-        # Processes add their gradients once, with the last pass.
-        with fabric.no_backward_sync(cast(Any, module), enabled=number < len(passes)):
-            loss, means = _losses(fabric, module, targets, some)
-            fabric.backward(share * loss)
+    rank, count = rank_and_count()
+    own = batch[rank::count]
+    state.optimiser.zero_grad(set_to_none=True)
+    sums = torch.zeros(2, device=device)
+    # A process without a crop of its own has the gradients of one with weight 0.
+    for some in in_passes(own or batch[:1], device):
+        loss, means = _losses(state.model, config, targets, some, device)
+        share = len(some) / len(batch) if own else 0.0
+        (share * loss).backward()
         sums += share * means
-    optimiser.step()
-    return cast(Tensor, fabric.all_reduce(sums))
+    add_over_processes([sums, *(value.grad for value in state.model.parameters() if value.grad is not None)])
+    state.optimiser.step()
+    return sums
 
 
 def _losses(
-    fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window]
+    model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
-    prediction = module(_crops(fabric, targets.layouts_um, windows, module.margin_px))
-    height = _crops(fabric, targets.heights_um, windows)
-    weight = _crops(fabric, targets.weights, windows)
-    if module.tile is not None:
-        # A pixel counts as much as it will in the blended field.
-        window = blending_window(module.tile, weight)
+    """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,).
+
+    Random crops come with their surroundings or are one tile of the model; quadrants are images of their own.
+    """
+    tile = model.tile if config.crops == "random" else None
+    # It changes in training if a blur learns its width.
+    reach = model.reach_px if config.crops == "random" else None
+    predict = model if tile is None and reach is None else model.interior
+    layout, height, weight = (
+        _crops(fields, windows, margin, device)
+        for fields, margin in (
+            (targets.layouts_um, reach or 0),
+            (targets.heights_um, 0),
+            (targets.weights, 0),
+        )
+    )
+    # Layouts and heights are float32 whatever the precision within.
+    with network_precision(_precision(config), device.type):
+        prediction = predict(layout).float()
+    if tile is not None:
+        # Each pixel has its weight in the blended field.
+        window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
+    # A mean over all pixels, valid or not, so crops count equally in groups of any size.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 
 
 def _crops(
-    fabric: Fabric, fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0
+    fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int, device: torch.device
 ) -> Tensor:
     crops = stack(fields, windows, margin_px)
     # A copy from pinned memory does not wait for the GPU's running work.
-    on_device: Tensor = fabric.to_device(crops.pin_memory() if fabric.device.type == "cuda" else crops)
-    return on_device
+    return crops.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else crops.to(device)
+
+
+def _precision(config: TrainingConfig) -> Precision:
+    return "bfloat16" if config.precision == "bf16-mixed" else "float32"
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
@@ -246,20 +225,3 @@ def _optimiser(model: Simulator, config: TrainingConfig) -> torch.optim.Optimize
     if config.optimiser == "adam":
         return torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-
-
-def _fabric() -> Fabric:
-    """The device; under ``torchrun`` one process per local rank."""
-    from lightning.fabric import Fabric
-
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    devices = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    fabric = Fabric(
-        accelerator="auto",
-        devices=devices,
-        num_nodes=max(1, world // devices),
-        strategy="ddp" if world > 1 else "auto",
-    )
-    if world > 1:
-        fabric.launch()
-    return fabric

@@ -1,4 +1,4 @@
-"""The card of a frozen model: what it is for, what it was made from, and how well it does."""
+"""The card of a frozen model: its use, its origin, and its errors."""
 
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -16,7 +16,7 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
-# How a figure was scored: on the scans of the training, or by fits that had not seen the scan.
+# How a figure was scored: on training scans, or on held-out scans.
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
@@ -28,7 +28,7 @@ _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported number: what, how much, on which scans, with which nuisances and background.
+    """One reported figure, with its scans, nuisances and background.
 
     ``ci95`` is its interval over scans.
     """
@@ -49,14 +49,14 @@ class CardMetric(Record):
 
 
 class ModelCard(RunFacts, Result):
-    """All that is needed to load, use and judge a frozen model.
+    """Everything needed to load, use and judge a frozen model.
 
-    ``background`` is what the microscope added to the training scans on average; only a comparison with
-    measured maps uses it, the model's height never contains it. ``at_bounds`` maps each fitted value on a
-    bound of its range to that bound. ``baseline``: the figures (``ScanFigures``) of the scans that the model
-    was made of, with which ``litho-models check`` compares new prints. ``attributed`` says to which side each
-    effect of undetermined role was attributed when the model was frozen; older cards list those of the
-    printer in ``declared_processes``.
+    ``background`` is the mean contribution of the microscope to the training scans. It is used only for
+    comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each fitted
+    value on a bound of its range to that bound. ``baseline``: the figures (``ScanFigures``) of the scans that
+    the model was made of, with which ``litho-models check`` compares new prints. ``attributed`` says to which
+    side each effect of undetermined role was attributed when the model was frozen; older cards list those of
+    the printer in ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -99,7 +99,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def held_out(self) -> CardMetric | None:
-        """The error on scans that a fit has not seen; None for a model that was in no benchmark."""
+        """The error on held-out scans; None for a model outside any benchmark."""
         return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 
     @field_validator("training", "split")
@@ -135,7 +135,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def page(self) -> str:
-        """Markdown with a Hugging Face front matter: what the model is, where to use it, what it scored."""
+        """The card as Markdown with a Hugging Face front matter."""
         page = Path(__file__).with_name("readme.md.jinja")
         return filled(page, card=self, bounds=bounds_text(self.at_bounds))
 

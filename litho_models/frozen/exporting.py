@@ -1,4 +1,4 @@
-"""A frozen model as a program of its own, for one size of layout: ``torch.export`` or ONNX."""
+"""Export a frozen model as a stand-alone program for one size of layout, by ``torch.export`` or ONNX."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from litho_data.foundation.errors import InputError
@@ -23,13 +22,13 @@ if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
 SUFFIXES = (".pt2", ".onnx")
-# An exported model prints what the model prints, to 0.01 nm.
+# Largest difference between an exported program and its model, 0.01 nm.
 LARGEST_DIFFERENCE_UM = 1e-5
 _ITEM = torch.ops.aten._local_scalar_dense.default
 _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um")
 
 
-def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[int, int] = 512) -> float:
+def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) -> float:
     """Write a frozen model as a program for layouts of one size; returns the largest difference, µm.
 
     The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. It checks
@@ -37,7 +36,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
 
     Args:
         out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
-        size_px: side of the layout, or (y, x).
+        size_px: side of the layout.
 
     Raises:
         InputError: another suffix; no ``onnx``; a model whose operations the format does not have, or
@@ -46,13 +45,12 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
     target = Path(out)
     if target.suffix not in SUFFIXES:
         raise InputError(f"export to {out}", got=repr(target.suffix), wanted=" or ".join(SUFFIXES))
-    shape = (size_px, size_px) if isinstance(size_px, int) else size_px
-    if min(shape) < 1:
-        raise InputError("size_px", got=shape, wanted="positive numbers")
+    if size_px < 1:
+        raise InputError("size_px", got=size_px, wanted="a positive number")
     generator = torch.Generator().manual_seed(0)
     lowest, highest = model.card["calibrated_range_um"]
-    layouts = lowest + (highest - lowest) * torch.rand((2, 1, 1, *shape), generator=generator)
-    simulator = _in_plain_operations(model.simulator)
+    layouts = lowest + (highest - lowest) * torch.rand((2, 1, 1, size_px, size_px), generator=generator)
+    simulator = copy.deepcopy(model.simulator).float().cpu()
     with torch.no_grad():
         wanted = simulator(layouts[1])
         program = _program(simulator, layouts)
@@ -67,29 +65,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
     return difference
 
 
-def _in_plain_operations(simulator: nn.Module) -> nn.Module:
-    """A copy whose networks run layer by layer: a program cannot contain the compiled stack."""
-    plain = copy.deepcopy(simulator).float().cpu().eval().requires_grad_(False)
-    for module in plain.modules():
-        activation = getattr(module, "activation", None)
-        if isinstance(activation, nn.LeakyReLU):
-            cast(Any, module).activation = _LeakySteps(activation.negative_slope)
-    return plain
-
-
-class _LeakySteps(nn.Module):
-    """A leaky ReLU that no fast path recognises."""
-
-    def __init__(self, slope: float):
-        super().__init__()
-        self.slope = slope
-
-    def forward(self, values: Tensor) -> Tensor:
-        return functional.leaky_relu(values, self.slope)
-
-
 class _Numbers(TorchDispatchMode):
-    """Python numbers that a model reads from tensors: recorded in one run, replayed in another.
+    """Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
     They are the radii of kernels, which follow from widths, and the ends of tables. Both follow from the
     weights alone, so a program may hold them as constants.

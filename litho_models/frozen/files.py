@@ -1,7 +1,7 @@
 """Frozen models: a folder of weights and a plain card, written once, loaded without running anything.
 
-``model.safetensors`` holds the weights, ``card.json`` what they are for, ``README.md`` the same for
-people. Only numbers and names of known classes are read: nothing is unpickled.
+``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card for people.
+Only numbers and names of known classes are read; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def save_frozen(
 
     Args:
         simulator: the fitted model.
-        folder: where; an older model there is replaced as a whole.
+        folder: output folder; an older model there is replaced as a whole.
         name: name in reports; the model's own by default.
         process_effects: effects of the printer that are part of the model, name to parameter values.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); those that follow
@@ -176,7 +176,7 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     try:
         return known(config)
     except (ArithmeticError, ValueError) as error:
-        # Each is in its range, but not with the others: a start beyond its upper bound, say.
+        # Each value is in its range, but not together with others, such as a start beyond its upper bound.
         raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
 
 

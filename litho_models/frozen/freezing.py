@@ -1,4 +1,4 @@
-"""The process model of a run folder, written as a frozen model on its own."""
+"""Freeze the process model of a run folder."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE, Attribution, ModelCard
 from litho_models.frozen.files import load_simulator, save_frozen
 
-# Where `train` and `close-loop` leave their model within the run folder.
+# Folders of the model in the run folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
 # Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
 SCAN_AXIS = "scan-axis"
@@ -26,9 +26,9 @@ def freeze(
     Args:
         source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
         out: folder of the frozen model.
-        attribute: the side to which effects of undetermined role are attributed, one for all or by name:
-            those of the printer become part of the model, those of the microscope do not. The card says so.
-            ``scan-axis`` is the part of a base model that acts along the lines of the scan.
+        attribute: the side to which effects of undetermined role are attributed, one for all or by name.
+            Effects of the printer become part of the model, those of the microscope do not. The card records
+            this. ``scan-axis`` is the part of a base model that acts along the lines of the scan.
 
     Raises:
         InputError: no model there, an effect that is not among the undetermined ones, an unknown side, or

@@ -1,10 +1,9 @@
-"""A frozen model on stored data: a file of levels, or the scans of a store and which of them it has seen."""
+"""Apply a frozen model to a file of levels or to a store, and find the scans that it has seen."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from litho_data.level.scan import write_heights
 from litho_data.readers.exported import export_of
@@ -35,26 +34,26 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
     """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
-    device = next((p.device for p in model.parameters()), torch.device("cpu"))
-    with torch.no_grad():
-        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
-        return model(layout, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um)[0, 0].cpu().numpy()
+    model.check_geometry(scan.pitch_um, scan.level_height_um)
+    return model.predict(scan.layout_um)
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
-    """The background in a model's card, if it has one and the scans are of the size it was learned on."""
+    """The background in a model's card, if it has one for scans of this size."""
     stated = model.card["background"]
     learned = Background.model_validate(stated) if stated is not None else None
     return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
 
 
 def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
-    """The scans that the model was trained on; none where it was made of other prints than the store's."""
+    """The scans on which the model was trained; none if it was made from other prints."""
     return set(model.card["training"].get("scan_ids", [])) if made_of_these_prints(model, dataset) else set()
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Whether a model was made of the prints in a store: the same dataset, or the same locked scans in it."""
+    """Whether a model was made from the prints in a store: the same dataset, or the same locked scans in
+    it.
+    """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
 

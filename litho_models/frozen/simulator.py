@@ -1,4 +1,4 @@
-"""A frozen model as design calls it: fixed weights, its geometry and calibrated range checked at the door."""
+"""A frozen model for design, with fixed weights, and checks of geometry and calibrated range."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 # Rounded to float32, the highest level may exceed the range a little; the next one exceeds it by 100 nm.
 _ROUNDING_UM = 1e-5
+
+
+Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
 
 
 class FrozenSimulator(nn.Module):
@@ -108,8 +111,36 @@ class FrozenSimulator(nn.Module):
             InputError: as ``forward``; whole numbers, which would be levels; fewer than two dimensions.
         """
         self.check_geometry(pitch_um)
-        step_um = self.card["level_height_um"]
-        return predict_layout(self, layout_um, pitch_um=self.pitch_um, level_height_um=step_um)
+        if isinstance(layout_um, Tensor):
+            return self._predict_tensor(layout_um)
+        if isinstance(layout_um, np.ndarray):
+            device = next(self.parameters(), torch.empty(0)).device
+            with torch.no_grad():
+                return self._predict_tensor(torch.as_tensor(layout_um, device=device)).cpu().numpy()
+        import xarray as xr
+
+        if not isinstance(layout_um, xr.DataArray):
+            kinds = "an array of NumPy or xarray, or a tensor"
+            raise InputError("layout", got=f"a {type(layout_um).__name__}", wanted=kinds)
+        _check_sampling(layout_um, self.pitch_um)
+        printed = layout_um.copy(data=self.predict(layout_um.to_numpy())).rename("height_um")
+        return printed.assign_attrs(units="µm", long_name="printed height")
+
+    def _predict_tensor(self, layout_um: Tensor) -> Tensor:
+        if not layout_um.is_floating_point():
+            raise InputError(
+                "layout",
+                got="whole numbers",
+                wanted="heights in µm",
+                hint=f"levels * {self.card['level_height_um']:g} are heights",
+            )
+        if layout_um.ndim < 2 or not layout_um.numel():
+            shape = tuple(layout_um.shape)
+            raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), none of them 0")
+        dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
+        fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
+        # One field after the other, so that a stack needs no more memory than one field.
+        return torch.cat([self(field) for field in fields]).reshape(layout_um.shape)
 
     def __repr__(self) -> str:
         card = self.card
@@ -195,46 +226,6 @@ class FrozenSimulator(nn.Module):
                 wanted=f"{self._lowest_um:g} to {self._highest_um:g} µm, the calibrated range",
                 hint="load it with extrapolate=True to accept a guess",
             )
-
-
-Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
-
-
-def predict_layout(model: nn.Module, layout_um: Field, *, pitch_um: float, level_height_um: float) -> Field:
-    """Do what ``FrozenSimulator.predict`` does, for a model of that pitch and level height."""
-    if isinstance(layout_um, Tensor):
-        return _predict_tensor(model, layout_um, level_height_um)
-    if isinstance(layout_um, np.ndarray):
-        device = next(model.parameters(), torch.empty(0)).device
-        with torch.no_grad():
-            layout = torch.as_tensor(layout_um, device=device)
-            return _predict_tensor(model, layout, level_height_um).cpu().numpy()
-    import xarray as xr
-
-    if not isinstance(layout_um, xr.DataArray):
-        kinds = "an array of NumPy or xarray, or a tensor"
-        raise InputError("layout", got=f"a {type(layout_um).__name__}", wanted=kinds)
-    _check_sampling(layout_um, pitch_um)
-    height = predict_layout(model, layout_um.to_numpy(), pitch_um=pitch_um, level_height_um=level_height_um)
-    printed = layout_um.copy(data=height).rename("height_um")
-    return printed.assign_attrs(units="µm", long_name="printed height")
-
-
-def _predict_tensor(model: nn.Module, layout_um: Tensor, level_height_um: float) -> Tensor:
-    if not layout_um.is_floating_point():
-        raise InputError(
-            "layout",
-            got="whole numbers",
-            wanted="heights in µm",
-            hint=f"levels * {level_height_um:g} are heights",
-        )
-    if layout_um.ndim < 2 or not layout_um.numel():
-        shape = tuple(layout_um.shape)
-        raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), none of them 0")
-    dtype = next((weight.dtype for weight in model.parameters()), layout_um.dtype)
-    fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
-    # One field after the other, so that a stack needs no more memory than one field.
-    return torch.cat([model(field) for field in fields]).reshape(layout_um.shape)
 
 
 def _check_sampling(layout_um: xr.DataArray, pitch_um: float) -> None:

@@ -1,4 +1,4 @@
-"""Names and folders of the frozen models that come with the package, those in the benchmark's table.
+"""Names and folders of the frozen models in the package, those of the benchmark's table.
 
 ``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
 """
@@ -39,7 +39,7 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
-    """The folder of a model as a command is given it: a path, ``zoo:NAME`` or ``hf://owner/name``.
+    """The folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
 
     Args:
         source: what the user typed.

@@ -1,1 +1,1 @@
-"""Building blocks of the models: blurs, functions of one value, the precision of products."""
+"""Building blocks of models: blurs, pointwise functions, numerical precision."""

@@ -1,11 +1,10 @@
 """Gaussian blur that is differentiable in its width: separable, normalised, cut at four sigma.
 
-Along each axis blocks of pixels are multiplied by one band of the kernel's weights. For fields up to a few
-thousand pixels this is faster than a Fourier transform, and no period or padding rule leaks in.
+Along each axis, blocks of pixels are multiplied by a band matrix of the kernel. For fields up to a few
+thousand pixels this is faster than a Fourier transform, and it needs no periodic padding.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -15,28 +14,29 @@ from torch.nn import functional
 from litho_data.foundation.errors import InputError
 
 SUPPORT_SIGMAS = 4.0
-# A narrower Gaussian has no weight left on the next pixel (exp(-50)); it also keeps 1/sigma finite.
+# Smallest sigma: the weight on the next pixel is then negligible (exp(-50)), and 1/sigma stays finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Pixels of a block; the wider one serves radii of 64 px and more. Wider blocks multiply more zeros of the
-# band; narrower ones multiply more slowly.
+# Pixels of a block, below and from a radius of 64 px. Wider blocks multiply more zeros of the band; narrower
+# blocks multiply more slowly.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
-# Wider than any field that is printed; a wider one would take the memory of a machine.
+# Wider than any printed field; a larger radius would exhaust memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
+Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
 # Radius of a kernel: four sigma, or three times sigma cut to whole pixels (the authors' code).
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
 def gaussian_blur(
     field: Tensor,
-    sigma_um: float | Tensor | tuple[float | Tensor, float | Tensor],
+    sigma_um: Sigma,
     pitch_um: float,
     *,
-    edge: Edge = "replicate",
-    radius_px: int | None = None,
+    edge: Edge | None = "replicate",
+    radius_px: int | tuple[int, int] | None = None,
 ) -> Tensor:
-    """Blur ``field`` (..., y, x) to the same size with a Gaussian of standard deviation ``sigma_um``.
+    """Blur ``field`` (..., y, x) with a Gaussian of standard deviation ``sigma_um``.
 
     g(d) ∝ exp(-d²/2σ²), normalised over its support of at least 4σ on each side.
 
@@ -45,57 +45,43 @@ def gaussian_blur(
         sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. Tensors
             carry gradients.
         pitch_um: sampling of the field, µm.
-        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
-        radius_px: reach of the kernel to each side; four sigma by default.
+        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside; the size stays the
+            same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).
+        radius_px: reach r of the kernel to each side, or a pair; four sigma by default.
 
     Raises:
-        InputError: a pitch that is not positive, or a field without pixels.
+        InputError: a pitch that is not positive, or a field without pixels or narrower than the support.
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
-    pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
-    sigmas = [torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um for sigma in pair]
-    radii = [kernel_radius_px(float(sigma.detach())) if radius_px is None else radius_px for sigma in sigmas]
-    return _blur(field, sigmas, radii, edge)
-
-
-def blur_interior(
-    field: Tensor, sigma_px: Tensor | tuple[Tensor, Tensor], radius_px: int | tuple[int, int]
-) -> Tensor:
-    """Blur and keep only the pixels whose whole support lies inside: (..., y - 2r, x - 2r).
-
-    Raises:
-        InputError: a field narrower than the support, or without pixels.
-    """
-    sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
-    radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
-    return _blur(field, sigmas, radii, None)
-
-
-def _blur(field: Tensor, sigmas: Sequence[Tensor], radii: Sequence[int], edge: Edge | None) -> Tensor:
-    """Along x, then along y; continued beyond the edge, or the interior alone."""
     if not field.numel():
         raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
+    widths = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
     # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
+        # Along x, then along y.
         for axis in (-1, -2):
+            sigma_px = torch.as_tensor(widths[axis], dtype=field.dtype, device=field.device) / pitch_um
             radius = radii[axis]
+            if radius is None:
+                radius = kernel_radius_px(float(sigma_px.detach()))
             if edge is not None:
                 field = pad_field(field, *((radius, 0) if axis == -2 else (0, radius)), edge)
             *samples, rows, columns = field.shape
             if field.shape[axis] <= 2 * radius:
                 wanted = f"more than {2 * radius} px (twice the radius of the kernel)"
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
-            # Along x all lines of all samples are one image.
+            # Along x, all lines of all samples form one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
-            blurred = _Blur.apply(images, _band(radius, sigmas[axis].to(field.dtype)), axis)
+            blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
         return field
 
 
 def kernel_radius_px(sigma_px: float) -> int:
-    """Whole pixels on each side that hold ``SUPPORT_SIGMAS`` standard deviations; 1 at least.
+    """Radius in whole pixels that contains ``SUPPORT_SIGMAS`` standard deviations; at least 1.
 
     Raises:
         InputError: a Gaussian wider than any field, or without a width.
@@ -110,7 +96,7 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Radius of a kernel by the rule of a model, limited to ``cap_px`` if that is given."""
+    """Radius of a kernel by a model's rule, at most ``cap_px`` if given."""
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 
@@ -127,7 +113,7 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 
 
 class _Blur(torch.autograd.Function):
-    """One axis (-1 or -2) of samples (s, y, x) blurred by a band of one symmetric kernel; linear in both.
+    """Blur samples (s, y, x) along one axis (-1 or -2) with the band of a symmetric kernel; linear in both.
 
     PyTorch's own backward pass through overlapping windows takes three times as long.
     """
@@ -149,7 +135,7 @@ class _Blur(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         samples, band, ctx.axis = inputs
         ctx.set_materialize_grads(False)
-        # The field is kept only where the width is learnt.
+        # The field is kept only if the width is learned.
         ctx.save_for_backward(band, samples if ctx.needs_input_grad[1] else None)
         ctx.save_for_forward(band, samples)
 
@@ -160,7 +146,7 @@ class _Blur(torch.autograd.Function):
         band, samples = ctx.saved_tensors
         axis, of_samples, of_band = ctx.axis, None, None
         if ctx.needs_input_grad[0]:
-            # The kernel is symmetric: the backward pass is the same blur, of the gradient padded with zeros.
+            # The kernel is symmetric, so the backward pass is the same blur of the zero-padded gradient.
             reach = band.shape[1] - band.shape[0]
             of_samples = _Blur.apply(_pad_axis(gradient, reach, reach, axis), band, axis)
         if samples is not None:
@@ -179,9 +165,9 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """For each sample the windows that its blocks are computed from: (blocks, other axis, window), views.
+    """For each sample, the overlapping windows of its blocks, as views: (blocks, other axis, window).
 
-    One sample at a time: windows overlap, and a product over several samples would copy them.
+    Samples are treated one at a time, because a product over several would copy the windows.
     """
     block, window = band.shape
     count = -(-(samples.shape[axis] - window + block) // block)
@@ -198,7 +184,7 @@ def _band(radius: int, sigma_px: Tensor) -> Tensor:
     """Matrix (block, block + 2 radius) whose row i holds the kernel centred on column i + radius."""
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
-    # All rows are windows on one symmetric kernel with zeros on both sides; the last row's window is first.
+    # All rows are windows on the zero-padded kernel, starting with the last row.
     block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
     kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
     return kernel.unfold(0, block + 2 * radius, 1).flip(0)

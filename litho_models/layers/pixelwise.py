@@ -1,4 +1,4 @@
-"""Functions of single pixels, evaluated block by block to limit the hidden values in memory."""
+"""Evaluate functions of single pixels block by block, to limit memory for hidden values."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -9,24 +9,24 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
-# A hundred hidden values for each of so many pixels take 3 MB, which fit into the last-level cache.
+# A hundred hidden values for each of these pixels take 3 MB, which fit into the last-level cache.
 _PIXELS_AT_ONCE = 2**13
 
 
 def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters: Iterable[Tensor]) -> Tensor:
-    """``function`` of all pixels, (n,); gradients flow to the features.
+    """Evaluate ``function`` at all pixels, (n,); gradients flow to the features.
 
     Args:
         function: maps features of any number m of pixels, (m, ...) each, to m values, (m,).
         features: (n, ...) each.
-        parameters: those of the function; gradients also flow to those that are trained.
+        parameters: parameters of the function; gradients flow to trained ones.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
         values: Tensor = _WithSlopes.apply(function, *features)
         return values
     if torch.is_grad_enabled():
-        # Computed again in the backward pass: the hidden values of a field would take gigabytes.
+        # The backward pass computes hidden values again, because those of a field would take gigabytes.
         parts = [checkpoint(function, *block, use_reentrant=False) for block in _in_blocks(features)]
     else:
         parts = [function(*block) for block in _in_blocks(features)]
@@ -34,9 +34,9 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 
 
 class _WithSlopes(torch.autograd.Function):
-    """Keep only the slopes for the backward pass, computed along with the values.
+    """Compute values and slopes together, and keep only the slopes for the backward pass.
 
-    They take as much memory as the features and save a second pass over the pixels.
+    The slopes take as much memory as the features and save a second pass over the pixels.
     """
 
     @staticmethod
@@ -59,7 +59,7 @@ class _WithSlopes(torch.autograd.Function):
 
 
 def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-    """Block after block of pixels: the features of each, (m, ...)."""
+    """Yield the features of each block of pixels, (m, ...)."""
     return zip(*(feature.split(_PIXELS_AT_ONCE) for feature in features), strict=True)
 
 
@@ -83,8 +83,8 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 class PointwiseNet(nn.Module):
     """A network of one scalar, 1 -> hidden layers -> 1, the same for all pixels (1 x 1 convolutions).
 
-    It is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points
-    and interpolated, which needs a thousand evaluations rather than one per pixel.
+    It is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points and
+    interpolated. This takes a thousand evaluations instead of one per pixel.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):
@@ -97,7 +97,7 @@ class PointwiseNet(nn.Module):
         self.knots = knots
 
     def forward(self, values: Tensor, lowest: float, highest: float) -> Tensor:
-        """Evaluate by interpolation; ``lowest`` ... ``highest`` is the range that the knots span."""
+        """Evaluate by interpolation; the knots span ``lowest`` ... ``highest``."""
         return interpolate(values, self.at_knots(lowest, highest), lowest, highest)
 
     def at_knots(self, lowest: float, highest: float) -> Tensor:
@@ -107,7 +107,7 @@ class PointwiseNet(nn.Module):
         return self.exact(points)
 
     def exact(self, values: Tensor) -> Tensor:
-        """Evaluate the network itself for every value, any shape."""
+        """Evaluate the network itself at every value, any shape."""
         with torch.autocast(device_type=values.device.type, enabled=False):
             return self.layers(values.reshape(-1, 1)).reshape(values.shape)
 

@@ -1,8 +1,8 @@
-"""Ranges of fitted values, and when a value counts as being on a bound.
+"""Ranges of fitted values, and the rule for a value on its bound.
 
-A fit moves a raw number; the model uses the value inside its range. Near a bound the value hardly follows the
-raw number any more, and a fit that went there could not come back. So fits keep raw numbers within
-``FLAT_FROM``, and a value whose raw number has reached that limit counts as being on its bound.
+A fit changes a raw number, and the model uses the corresponding value inside its range. Near a bound the
+value hardly changes with the raw number, so a fit could not return from there. Fits therefore keep raw
+numbers within ``FLAT_FROM``; a value whose raw number is at that limit counts as on its bound.
 """
 
 import math
@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# There a sigmoid has 7 % of its largest slope and is 2 % of the range away from the bound.
+# At this raw number a sigmoid has 7 % of its largest slope and is 2 % of the range from the bound.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 
@@ -25,7 +25,7 @@ class Range:
 
     Attributes:
         name: name of the value, with its unit.
-        lower, upper: its bounds; an infinite ``upper`` takes the softplus.
+        lower, upper: bounds; with an infinite ``upper`` the softplus is used.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Range:
         return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
 
     def raw(self, value: float) -> Tensor:
-        """The raw number of a value.
+        """The raw number that gives a value.
 
         Raises:
             InputError: a value outside the range, or on a bound.
@@ -57,7 +57,7 @@ class Range:
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """The bound that a raw number has reached; None inside the range."""
+        """The bound on which a raw number lies; None inside the range."""
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
             return self.lower

@@ -1,4 +1,4 @@
-"""The models whose shortcomings may be sought: several small ones, or the one that is asked for."""
+"""The base models that the loop may correct: the one that is asked for, or several small ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# Bases that compete where none is asked for, the first one the form of the paper's physics.
+# Bases that compete by default. The first has the form of the paper's physics.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
@@ -32,16 +32,17 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
 ) -> dict[str, nn.Module]:
-    """The models that may be corrected, by name: what was asked for; a network is trained without each fold.
+    """Return the models that may be corrected, by name. A network is trained once without each fold.
 
     Args:
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
         study: scans, folds, seed, workers.
-        steps: optimiser steps of a network, the recipe's if None; ``cache``: where its trainings are kept.
+        steps: optimiser steps of a network, None: those of its recipe; ``cache``: folder for its trainings.
         fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
-        InputError: no such base, one of another pitch, or settings of one that is not a small model.
+        InputError: an unknown base, a base of another pitch, or settings for a base that is not a small
+            model.
     """
     scans = [scan.stored for scan in study.scans]
     named = _built(base, scans[0], fields) if base in MODELS else None

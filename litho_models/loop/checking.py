@@ -1,8 +1,8 @@
-"""Does the name of a cause stand, with everything else in place?
+"""Check the name of a cause beside everything else in the model.
 
-A cause that is missing beside a named one leaves a residual that has nothing to do with the named change. A
-name that only resembles the cause leaves one that is the named change in another shape: scaled with the
-height or the place, blurred, displaced, squared.
+If the name is right, the residual no longer depends on the named change. If the name only resembles the true
+cause, the residual contains variants of the change: scaled with height or position, blurred, displaced or
+squared.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from litho_models.loop.search import Cause, describe, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-# Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
-# formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
-# more.
+# Largest further gain by variants of a cause's change, as a share of its gain. In trials on the virtual fab
+# true causes leave less than 1 % (layer-stacking 10 %), and effects that only resemble the cause leave 20 %
+# and more.
 FORM_SHARE = 0.15
 
 
 @dataclass(frozen=True)
 class Check:
-    """What the causes of a model are checked against.
+    """Checks the causes of one model against everything that could replace them.
 
     Attributes:
-        state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all that might stand in a
-            cause's place.
-        left_nm2: what all features of layout and place still explain beside it.
-        secants: of the laws.
+        state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all candidates that could
+            replace a cause.
+        left_nm2: squared error that features of layout and position still explain beside the model.
+        secants: those of the laws.
     """
 
     state: State
@@ -49,16 +49,16 @@ class Check:
 
     @property
     def laws_in(self) -> list[str]:
-        """The laws of the model."""
+        """Names of the laws in the model."""
         return [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
 
     @property
     def study(self) -> Study:
-        """What the model is fitted to."""
+        """The study that the model is fitted to."""
         return self.state.study
 
     def of(self, cause: Cause) -> Cause:
-        """One of the causes, judged with everything else in the model."""
+        """Judge one cause with everything else in the model."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
         reshaped_nm2 = reshaped_gain(without, self.state)
@@ -70,20 +70,21 @@ class Check:
         elif larger:
             reason = f"may only correct the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
-            reason = f"beside {', '.join(self.laws_in)} it takes less than half of what it took without"
+            reason = f"beside {', '.join(self.laws_in)} it gains less than half of what it gains without them"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
-            reason = f"the scans ask for more of it than there can be: {', '.join(exhausted)}"
-        # A small part of what is left is the little that any columns take of causes that are still missing.
+            reason = f"its best strength is beyond the largest possible one: {', '.join(exhausted)}"
+        # Any columns explain a small part of causes that are still missing, so a small gain proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
-            taken = f"its change in another shape takes {100 * share:.0f} % of its gain more"
+            taken = f"variants of its change gain another {100 * share:.0f} %"
             reason = f"only resembles the cause: {taken}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """A much larger law, or cause whose change in another shape takes half of what this one does.
+        """Name of a much larger law, or of a much larger cause of which a variant takes half of this cause's
+        gain.
 
-        A cause that gains a tenth of another or less may be an error of the other's formula, and a law only
-        comes close. Empty if there is none.
+        A cause with at most a tenth of another's gain may only correct the other's formula. Laws are
+        approximate anyway. Empty if there is none.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -96,9 +97,9 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Compare a cause that passed all other checks with laws: it loses its name if short laws fit better.
+        """Refuse the name of a cause that passed all other checks if short laws fit better.
 
-        Two laws at most, with no more numbers than the cause has.
+        At most two laws are used, with no more parameters than the cause has.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -108,14 +109,14 @@ class Check:
             numbers -= law.numbers
             laws.append(law.name)
             if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
-                return replace(cause, reason=f"short laws do better in its place: {', '.join(laws)}")
+                return replace(cause, reason=f"short laws fit better instead: {', '.join(laws)}")
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Compare a cause that passed all other checks with the best table in its place.
+        """Refuse the name of a cause that passed all other checks if it is part of a larger table.
 
-        If the table gains over twice as much, and the cause gains nothing beside it, the cause is only a part
-        of something larger that has no name.
+        The cause is refused if the best table instead of it gains over twice as much, and the cause gains
+        nothing beside the table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -123,11 +124,11 @@ class Check:
                 both = with_table(self.state, table)
                 judged = judge(both.without(cause.name).freed_nm2, both.freed_nm2, self.study)
                 if reason := judged.reason(grouped=cause.by != ALL):
-                    return replace(cause, reason=f"{table.name} takes its place, and more: {reason}")
+                    return replace(cause, reason=f"{table.name} explains the same and more: {reason}")
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """The law that promises the largest gain, if it is a fair part of what the cause gains."""
+        """The law with the largest predicted gain, if that is a fair part of the cause's gain."""
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
@@ -140,10 +141,10 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
+    """Gain (nm²) of variants of a cause's change on held-out scans, in addition to the change itself.
 
     Args:
-        without, state: the model without and with the cause.
+        without, state: model without and with the cause.
     """
     grams, study = [], state.study
     before, after = (one.maps_um(study.windows) for one in (without, state))
@@ -151,7 +152,7 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    # Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.
+    # Weight of "no variant", in scans. Without it so many parameters would fit the noise of a few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
@@ -160,10 +161,10 @@ def reshaped_gain(without: State, state: State) -> float:
 
 
 def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:
-    """A change of the prediction (y, x), µm, and the same in other shapes."""
+    """Return a change of the prediction (y, x), µm, and its variants."""
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
-    # Widths in pixels: small beside what the process resolves, on films of nanometres too.
+    # Widths in pixels, so that they are small relative to the resolution of any process, also on films.
     near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
     soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]

@@ -1,7 +1,9 @@
-"""Close the loop on a set of scans: from the residual of a base to causes, laws and what is left.
+"""Close the loop on a set of scans: find causes and laws in the residual of a base.
 
-``close`` is an estimator: it chooses and fits on the scans that it is given, and what it returns predicts any
-other scan. Whatever is judged on scans is chosen without them by calling it on the rest.
+The search for causes is run beside each base, and bases are compared with their causes.
+
+``close`` is an estimator. It chooses and fits on the given scans, and its result predicts any other scan. To
+judge the choices on some scans, call it on the others.
 """
 
 from __future__ import annotations
@@ -12,11 +14,11 @@ from functools import cache
 
 from torch import nn
 
-from litho_models.effects import Effect, screened_effects
+from litho_models.effects import screened_effects
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import judge
+from litho_models.loop.judging import SMALLEST_SHARE, judge
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
@@ -28,19 +30,19 @@ from litho_models.scan_terms.grouped import ALL
 
 @dataclass(frozen=True)
 class Closed:
-    """What was chosen and fitted on some scans.
+    """The choices and fits made on some scans.
 
     Attributes:
-        base_name: of the base with the smallest error; ``others``: those that lost against it.
-        plain: the base fitted to the scans as they are; ``base``: to scans freed of what a group shares.
-        named: among causes; ``lawful``: among short laws beside them.
-        described: tables over a covariate, which say where the rest lies; the model has them last.
-        rests: what features of layout and place still explain, by stage.
-        untestable: effects that could not be tested, with the reason.
+        base_name: name of the chosen base; ``rivals``: results of the same search beside the other bases.
+        plain: the base fitted to the original scans; ``base``: the base fitted to the freed scans.
+        named: result of the search among causes; ``lawful``: of the search for short laws beside them.
+        described: tables over a covariate, which describe the remaining error; they act last in the model.
+        rests: what features of layout and position still explain after each stage.
+        untestable: effects that could not be tested, with reasons.
     """
 
     base_name: str
-    others: Mapping[str, nn.Module]
+    rivals: Mapping[str, Found]
     plain: State
     base: State
     named: Found
@@ -51,17 +53,17 @@ class Closed:
 
     @property
     def given(self) -> Study:
-        """The scans as they are."""
+        """The original scans."""
         return self.plain.study
 
     @property
     def study(self) -> Study:
-        """The freed scans."""
+        """The scans without what groups of them share."""
         return self.base.study
 
     @property
     def final(self) -> State:
-        """The corrected model: causes, laws, and tables where neither holds."""
+        """The corrected model, with causes, laws and tables."""
         return self.described.state
 
     @property
@@ -71,50 +73,71 @@ class Closed:
 
     @property
     def found(self) -> list[Cause]:
-        """All that is reported."""
+        """All findings that are reported."""
         return [*self.traced, *self.described.causes]
+
+    def survives_on(self, cause: Cause) -> list[str]:
+        """The other bases beside which the search found the same cause, or an effect that looks the same."""
+        alike = {cause.name, *cause.alike}
+        return [
+            name
+            for name, rival in self.rivals.items()
+            if any(alike & {one.name, *one.alike} for one in rival.causes)
+        ]
+
+    def needed_by_all(self, cause: Cause) -> bool:
+        """Whether every other base lacks the cause too, except bases with more parameters, which may have
+        absorbed it.
+        """
+        base, survives_on = self.plain.twin.own, self.survives_on(cause)
+        others = {name for name, rival in self.rivals.items() if rival.state.twin.own <= base}
+        return others <= {*survives_on}
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find what a base lacks on these scans.
+    """Find what a base model lacks on these scans.
 
     Args:
         study: development scans.
-        bases: simulators by name, those with few parameters refitted, others taken as they are: the one with
-            the smallest error on held-out scans is corrected.
+        bases: simulators by name. Those with few parameters are refitted.
     """
-    fits = {}
+    plain = {}
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
-        fits[name] = fit_state(Twin.bare(base), study)
-    best = min(fits, key=lambda name: fits[name].mse_nm2)
-    plain = fits[best]
-    study.report("learning what scans of a group share")
-    freed = replace(study, scans=prepare_scans(freed_scans(plain)))
-    start = fit_state(plain.twin, freed)
-    learner = Learner(freed, start.maps_um(freed.scans))
-
-    @cache
-    def rest(state: State) -> Rest:
-        return learner.rest(state.maps_um(freed.scans))
-
+        plain[name] = fit_state(Twin.bare(base), study)
+    study.report("learning what groups of scans share")
+    nearest = min(plain.values(), key=lambda state: state.mse_nm2)
+    freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
     excluded = untestable(freed)
     candidates = [
         one
         for one in screened_effects(freed.tip_radius_um)
         if one.name not in excluded and one.of_films == freed.of_films
     ]
-    named, lawful, described = _searched(start, candidates, rest)
+    starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
+    searches = {}
+    for name, state in starts.items():
+        study.report(f"looking for what {name} lacks")
+        searches[name] = search(state, candidates)
+    chosen = _simplest(searches)
+    start, named = starts[chosen], searches.pop(chosen)
+    learner = Learner(freed, start.maps_um(freed.scans))
+
+    @cache
+    def rest(state: State) -> Rest:
+        return learner.rest(state.maps_um(freed.scans))
+
+    lawful, described = _checked(start, named, rest)
     stages: dict[State, str] = {}
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
     ):  # fmt: skip
-        # By the model, so that a stage that changes nothing counts with the one before it.
+        # Stages are told apart by their model: one that changes nothing equals the stage before it.
         stages.setdefault(state, name)
     return Closed(
-        base_name=best,
-        others={name: base for name, base in bases.items() if name != best},
-        plain=plain,
+        base_name=chosen,
+        rivals=searches,
+        plain=plain[chosen],
         base=start,
         named=named,
         lawful=lawful,
@@ -124,22 +147,35 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     )
 
 
-def _searched(
-    start: State, candidates: Sequence[Effect], rest: Callable[[State], Rest]
-) -> tuple[Found, Found, Found]:
-    """Causes, laws beside them, and tables beside both; each cause is checked with everything else in place.
-
-    One that fails is taken out, and laws are sought anew without it.
+def _simplest(searches: Mapping[str, Found]) -> str:
+    """Choose the base with the fewest parameters, causes included, among those with nearly the smallest
+    error.
     """
-    study, named = start.study, search(start, candidates)
-    # Laws and tables are of heights.
+    best_nm2 = min(found.state.mse_nm2 for found in searches.values())
+    close = {
+        name: len(found.state.twin.vector)
+        for name, found in searches.items()
+        if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
+    }
+    return min(close, key=lambda name: close[name])
+
+
+def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
+    """Search for laws, then tables, beside the causes, and check each cause beside everything else.
+
+    A cause that fails is removed, and the search for laws is repeated without it.
+
+    Args:
+        start: the base; ``named``: its causes, from which refused ones are removed.
+    """
+    study = start.study
+    # Laws and tables describe heights, not films.
     laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
     secants = Secants(start.twin, study.windows)
     while True:
-        study.report("looking for a law in what is left")
-        # Two terms at most, so that a law is a short formula.
-        lawful = search(named.state, laws, 2, secants)
-        study.report("describing what is left")
+        study.report("searching the residual for laws")
+        lawful = search(named.state, laws, 4, secants)
+        study.report("describing the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
             in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
@@ -150,8 +186,9 @@ def _searched(
                 named.causes = [check.beside_table(check.beside_laws(one)) for one in named.causes]
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
-            return named, lawful, _in_model(lawful.state, described)
-        # What may only correct another formula goes first: that formula is then judged without it.
+            return lawful, _in_model(lawful.state, described)
+        # Causes that may only correct another formula are removed first, so that formula is judged without
+        # them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -161,7 +198,7 @@ def _searched(
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """The model with every table that is confirmed there too, fitted beside all the rest."""
+    """Add to the model every table that is still confirmed when fitted with all other parts."""
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
@@ -173,9 +210,9 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """The model, with the largest table beside it if that takes more than all causes together.
+    """Add the largest table to the model if it gains more than all causes together.
 
-    A table follows whatever it can. It is held against all causes, not against single ones.
+    A table fits almost anything, so it is compared with all causes together, not with single ones.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

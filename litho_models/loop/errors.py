@@ -1,4 +1,4 @@
-"""Errors of the models of a loop on scans held out from them, the measurement learned with each."""
+"""Errors of a loop's models on held-out scans, each with its own measurement model."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import State, fit_state
-from litho_models.loop.judging import judge
+from litho_models.loop.fits import State
 from litho_models.loop.measured import Fit, fit_with_measurement
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import Blocks, Policy
 from litho_models.scan_terms.background import learn_background
-from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.shapes import edges_of_scan
@@ -37,11 +35,11 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy; films have no zero of their own to be freed of.
+    """Errors of maps (y, x), µm, under each reported policy. Scans of films have no free zero.
 
     Args:
-        numbers: fitted numbers of printer and measurement; ``terms``: model, measurement and held_out of
-            ``ErrorRow``.
+        numbers: number of fitted parameters of printer and measurement;
+            ``terms``: ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``.
     """
     rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
@@ -72,10 +70,10 @@ def error_rows(
 
 
 class HeldOut:
-    """The models that a loop has found, each fitted with its measurement to other scans than are scored.
+    """Models of a loop, fitted with their measurement models to scans that are not scored.
 
     Args:
-        closed: what was found.
+        closed: result of ``close``.
     """
 
     def __init__(self, closed: Closed):
@@ -86,20 +84,21 @@ class HeldOut:
 
     @property
     def ends(self) -> dict[Stage, State]:
-        """Base and corrected model."""
+        """The base and the corrected model."""
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Of all models, scans predicted without their fold; of first and last also without their print.
+        """Errors of all models, each scan predicted without its fold; of base and final model also without
+        its print.
 
-        Between them stands the model with the causes alone, if it is neither.
+        If it differs from both, the model with only the causes is listed between them.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
         maps = plain.maps_um(self.study.scans)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
         if not self.study.of_films:
-            # A smooth background has five numbers.
+            # A smooth background has five coefficients.
             rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
         between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
         for name, state in {"base": self.closed.base, **between, **self.ends}.items():
@@ -114,13 +113,13 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """The maps (y, x) that the scans should show, print and measurement learned without their fold."""
+        """Predicted scans (y, x), with print and measurement learned without the scan's fold."""
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) without each cause or law, the rest fitted again.
+        """Increase of the error (k = 1) without each cause or law, after the others are refitted.
 
-        The printer is left as it stands, the measurement learned again beside it.
+        The printer's own values stay fixed, and the measurement is learned again.
         """
 
         def error_nm(state: State) -> float:
@@ -135,7 +134,7 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Residual maps (y, x), nm, of all scans before and after, each with its own zero taken out."""
+        """Residual maps (y, x), nm, of all scans before and after, without the offset of each scan."""
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
             left = np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan)
@@ -147,20 +146,6 @@ class HeldOut:
             for scan, before, after in zip(self.scans, *maps, strict=True)
         ]
 
-    def survives_on(self) -> dict[str, list[str]]:
-        """For each cause and law, the other bases on which it is confirmed too, all others in place."""
-        final, study = self.closed.final.twin, self.closed.study
-        found: dict[str, list[str]] = {name: [] for name in final.names}
-        for base_name, base in self.closed.others.items() if found else ():
-            study.report(f"trying what was found on {base_name}")
-            bare = fit_state(Twin.bare(base), study)
-            full = fit_state(final.over(bare.twin.fitted_base), study)
-            for name, one in final.effects.items():
-                judgement = judge(full.without(name).freed_nm2, full.freed_nm2, study)
-                if judgement.passed(grouped=one.by != ALL):
-                    found[name].append(base_name)
-        return found
-
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
         terms = {"measurement": "shared", "held_out": "scans", **terms}
         return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
@@ -171,10 +156,10 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Maps of all scans by fits without their part, and the most numbers that any of them took.
+        """Maps of all scans by fits without their part, and the largest number of parameters of these fits.
 
         Args:
-            starts: part to where its fit begins.
+            starts: part to the start of its fit.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -206,7 +191,7 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Errors of all scans, each by models in whose choice it took no part; ``found``: these, and for whom."""
+    """Errors of all scans by models chosen without them; ``found``: these models, and the scans of each."""
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))
     for models, out in found:

@@ -1,6 +1,6 @@
-"""Fits of a twin to scans: once to all of them, and once without each fold, which it then predicts.
+"""Fit a model of the printer to all scans, and without each fold, to predict that fold.
 
-What single scans may add is projected out, so that it cannot pull the numbers of the printer.
+Terms of single scans are projected out, so they do not bias the values of the printer.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
+# Free terms of each scan in a fit. The gain is not one of them, because long-range effects change it.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
-# What a comparison of errors leaves to the single scans.
+# Free terms of each scan in a comparison of errors.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
 
@@ -43,12 +43,12 @@ def _silent(message: str) -> None:
 
 @dataclass(frozen=True)
 class Study:
-    """The scans, who holds each out, and how what is said of them is judged.
+    """Scans with their folds, and the settings by which findings are judged.
 
     Attributes:
-        scans: prepared; ``fold_of``: (scans,) number of the fold that holds each out.
-        seed: of folds, calibration blocks and permutations.
-        workers: where independent fits are made; ``report``: told in a sentence what happens.
+        scans: prepared; ``fold_of``: (scans,) number of the fold of each scan.
+        seed: seed of folds, calibration blocks and permutations.
+        workers: pool for independent fits; ``report``: gets progress messages.
     """
 
     scans: Sequence[PreparedScan]
@@ -66,57 +66,59 @@ class Study:
         workers: Workers = HERE,
         report: Callable[[str], None] = _silent,
     ) -> Study:
-        """Scans of a store dealt into folds, one for each scan at most."""
+        """Deal the scans of a store into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
         lists = grouped_folds(ids, min(folds, len(ids)), seed)
         fold = {one: number for number, members in enumerate(lists) for one in members}
         return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
 
     def of_others(self, scans: Sequence[PrintedScan]) -> Study:
-        """Other scans dealt alike, without a word."""
+        """Deal other scans in the same way, without progress messages."""
         return Study.dealt(scans, len(self.folds), self.seed, self.workers)
 
     def __getstate__(self) -> dict[str, object]:
-        """In another process a study has no workers of its own, and nobody to tell."""
+        """Drop workers and progress messages, which do not exist in another process."""
         return {**self.__dict__, "workers": HERE, "report": _silent}
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
-        """Of each fold the numbers of the scans that are not in it, and of those that are."""
+        """For each fold the indices of the scans outside and inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
     @property
     def windows(self) -> list[PreparedScan]:
-        """What fits and screening see of the scans."""
+        """The part of each scan that fits and screening use."""
         return [scan.window for scan in self.scans]
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Radius of the tip, or the most that it can be, if the store knows: that of the first scan."""
+        """Radius of the first scan's tip, or its upper bound, if the store has one."""
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
     @property
     def of_films(self) -> bool:
-        """Whether the scans are micrographs of a film: what counts are its edges, and no height drifts."""
+        """Whether the scans are micrographs of a film, whose edges are scored and whose heights do not
+        drift.
+        """
         return self.scans[0].stored.seen_by == "sem"
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
-        """The groups that the scans fall into."""
+        """The groups of the scans."""
         return groupings([scan.stored for scan in self.scans])
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A twin fitted to the scans of a study.
+    """A model fitted to the scans of a study.
 
     Attributes:
-        twin: at the numbers fitted to all scans; ``per_fold``: the same, each fitted without its own scans.
-        linear: each window at ``twin``: residual, derivatives, and what the scan may add by itself.
-        held_out_um: residual (n,) of each window by the fit that has not seen it.
-        freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
+        twin: the model fitted to all scans; ``per_fold``: the models fitted without each fold.
+        linear: residual, derivatives and free terms of each window at ``twin``.
+        held_out_um: residual (n,) of each window, predicted without its fold.
+        freed_nm2: (scans,) squared error per pixel of ``held_out_um`` after removal of the scan's free terms.
     """
 
     study: Study
@@ -125,7 +127,7 @@ class State:
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_nm2: np.ndarray
-    # The model without each of its effects: several steps ask for the same one.
+    # Cached models without one effect; several steps need the same one.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
@@ -133,23 +135,25 @@ class State:
         return float(self.freed_nm2.mean())
 
     def __getstate__(self) -> dict[str, object]:
-        """It comes from another process without its scans."""
+        """Leave out the scans when a state is sent to another process."""
         return {**self.__dict__, "study": None}
 
     def without(self, name: str) -> State:
-        """The model without one of its effects, fitted again from here."""
+        """Remove one effect and refit the model from its current values."""
         if name not in self._without:
             self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predicted prints (y, x) of the scans or their windows, each by the twin that has not seen it."""
+        """Predicted prints (y, x) of the scans or their windows, each by the model fitted without its
+        fold.
+        """
         folds = zip(self.study.fold_of, scans, strict=True)
         return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
 
 class TwinProblem:
-    """A twin on windows of scans; derivatives are one-sided differences."""
+    """Least-squares problem of a model on windows of scans, with one-sided difference quotients."""
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin = twin
@@ -173,7 +177,7 @@ class TwinProblem:
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
             if slot is not None and not twin.is_of(slot, window):
                 continue
-            # Only what is before a number in the chain stays as it is.
+            # Only the steps of the chain before a parameter can be reused.
             known = other.base_height(layout, window) if slot is None else None
             if slot is not None and get_effect(slot.effect).acts_on == "height":
                 known = base
@@ -181,20 +185,21 @@ class TwinProblem:
         return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
-        """Measured minus predicted of all windows, µm."""
+        """Measured minus predicted heights of all windows, µm."""
         twin = self._twin.at(vector)
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Effects stay within their range, the base does not go too far at once."""
+        """Largest allowed steps: effects stay in range, and the base moves only a little at once."""
         return self._twin.at(vector).room()
 
 
 def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
-    """Fit a twin to all windows of a study, then without each fold in turn.
+    """Fit a model to all windows of a study, then without each fold.
 
     Args:
-        from_here: begin where the twin stands, or else there or with the base as it is before any fit.
+        from_here: start at the current values; otherwise at these or at the base's default values, whichever
+            are better.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -216,15 +221,15 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Where the twin stands, or with the base's numbers before any fit: the better after a fit to some scans.
+    """Choose the start of a fit, the current values or the base's default values, by a fit to some scans.
 
-    The best base without an effect is no good place to look for one beside it: what the base took of the
-    effect keeps it there, on the wrong side of a hill.
+    A base that was fitted without an effect has absorbed part of it, and may then be stuck in a local optimum
+    when the effect is added.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
         return twin.vector
-    # The way to the neighbourhood of the optimum is walked on every third scan.
+    # Every third scan is enough to come close to the optimum.
     some = TwinProblem(twin, windows[::3] if len(windows) > 6 else windows)
     fits = [fit_least_squares(some, start, RULES) for start in (twin.vector, unfitted)]
     return min(fits, key=lambda fit: eliminated_sum(fit.linear, RULES.term_weight)[2]).vector
@@ -233,28 +238,28 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Columns (n, m) at the sampled pixels, without what a single scan may add to a prediction (y, x), µm."""
+    """Project the free terms of a scan out of columns (n, m) at the sampled pixels; prediction (y, x), µm."""
     basis = window.free_basis(prediction_um, terms)
     return columns - basis @ (basis.T @ columns)
 
 
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
-    """The twin fitted to some of the windows with the derivatives of the common fit.
+    """Fit the model to some of the windows with the derivatives of the common fit.
 
-    The common fit, which has seen all windows, is where it starts: nothing may be left there.
+    The fit starts from the common fit, which has seen all windows, so it must converge fully.
     """
     twin = common.of_fold(fold)
     problem, vector = TwinProblem(twin, windows), twin.vector
     if not len(vector):
         return twin
     if twin is not common:
-        # At the common fit each window was predicted by a model that has seen the fold.
+        # The common fit has seen every fold, so its predictions are not held out.
         linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(6):
         step = solve_damped(normal, right, 1e-6, twin.at(vector).room())
         trial = vector + step
-        # So small a step is what the derivatives say.
+        # For so small a step the linear model is exact enough.
         if promised_gain(normal, right, step) <= 1e-4 * total:
             vector = trial
             break

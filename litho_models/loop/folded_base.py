@@ -1,4 +1,4 @@
-"""A base model that is trained elsewhere, one per fold."""
+"""A base model with one trained copy per fold."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from litho_data.commands.progress import progress
 from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 
-# Where other processes train, it is sent to them.
+# Sent to other processes for training.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 
 
 class FoldedBase(nn.Module):
-    """One trained model per fold; each scan is predicted by the one that has not seen it.
+    """One trained model per fold; each scan is predicted by the model trained without it.
 
     Args:
-        models: by fold; ``fold_of``: scan id to fold; ``common``: for every other scan.
+        models: by fold; ``fold_of``: scan id to fold; ``common``: model for all other scans.
     """
 
     def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
@@ -27,7 +27,7 @@ class FoldedBase(nn.Module):
         self.models = nn.ModuleList(models)
         self.common = common
         self.fold_of = dict(fold_of)
-        # Weights stay as the trainer left them: frozen ones would be predicted with other roundings.
+        # Weights stay as trained, because freezing would change roundings.
         self.eval()
 
     def of_fold(self, fold: int) -> nn.Module:
@@ -35,7 +35,7 @@ class FoldedBase(nn.Module):
         return self.models[fold]
 
     def of_scan(self, scan_id: str) -> nn.Module:
-        """The model that has not seen this scan."""
+        """The model trained without this scan."""
         fold = self.fold_of.get(scan_id)
         return self.common if fold is None else self.models[fold]
 
@@ -45,7 +45,7 @@ def train_folds(
 ) -> FoldedBase:
     """Train once without each fold and once on all development scans."""
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
-    # No scan has the number of the last one.
+    # The last model belongs to no fold.
     last = max(fold.values()) + 1
     jobs = [(out, trainer, [one for one in scans if fold[one.id] != out]) for out in range(last + 1)]
     done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")

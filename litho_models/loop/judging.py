@@ -1,4 +1,4 @@
-"""One judge: is a change of the model confirmed on scans that it was not fitted on? Scans are the units."""
+"""Decide whether held-out scans confirm a change of the model. Scans are the units."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from litho_models.loop.fits import Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
-# Every candidate and law is tried by every grouping: one in a hundred exchanges may do as well.
+# Limit of p for a grouping. It is strict because every candidate is tried with every grouping.
 EXCHANGED_P = 0.01
-# By chance alone seven gains out of seven come once in 128: below eight scans nothing is confirmed.
+# Seven gains in seven scans have p = 1/128 by chance, so fewer than eight scans confirm nothing.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# A strength by group was held against exchanged labels already: half of the scans may have nothing to gain.
+# A strength by group has passed the test with permuted labels, so half of the scans may gain nothing.
 GROUPED_P = 0.05
-# Of the squared error: what is worth a strength by group, or a search. A change of the model has to take
-# twice that, one percent of the root: its form is always wrong by a little.
+# Smallest share of the squared error that justifies a strength by group, or a search. A change of the model
+# must gain twice that (1 % of the root), because every formula is slightly wrong.
 SMALLEST_SHARE = 0.01
 
 
@@ -27,9 +27,9 @@ class Judgement:
     """Gain of a change on held-out scans.
 
     Attributes:
-        before_nm2, gain_nm2: mean squared error before, and what the change takes from it.
-        gains_nm2: (scans,) of each scan.
-        p: one-sided, by flips of the signs of the scans' gains; ``low_nm2``: lower end of the interval.
+        before_nm2, gain_nm2: mean squared error before the change, and its decrease.
+        gains_nm2: (scans,) gain of each scan.
+        p: one-sided, by sign flips of the scans' gains; ``low_nm2``: lower end of the interval.
     """
 
     before_nm2: float
@@ -40,20 +40,20 @@ class Judgement:
 
     @property
     def improved(self) -> tuple[int, int]:
-        """Scans that are better, and all."""
+        """Number of improved scans, and of all scans."""
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
     @property
     def matters(self) -> bool:
-        """Large enough to be of use."""
+        """Whether the gain is large enough to be useful."""
         return self.gain_nm2 >= 2 * SMALLEST_SHARE * self.before_nm2
 
     def passed(self, *, grouped: bool = False) -> bool:
-        """Whether it is confirmed."""
+        """Whether the change is confirmed."""
         return not self.reason(grouped=grouped)
 
     def reason(self, *, grouped: bool = False) -> str:
-        """Why it is not confirmed; empty if it is."""
+        """Why the change is not confirmed; empty if it is."""
         better, count = self.improved
         if count < FEWEST_SCANS:
             return f"{count} scans, at least {FEWEST_SCANS} are needed to confirm anything"
@@ -74,6 +74,6 @@ def judge(before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study) -> Judgem
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Whether a rival is worse than the best in nearly every scan, by a quarter of the gain or more."""
+    """Whether a rival is worse than the best in nearly every scan, and by at least a quarter of the gain."""
     lost = judge(other_nm2, best_nm2, study)
     return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

@@ -1,7 +1,7 @@
-"""How much of a residual could still be learned: a ridge over features of layout and place, out of fold.
+"""Estimate how much of a residual could still be learned, by a cross-validated ridge regression.
 
-It has no name for what it finds and goes into no model. It says whether something is left to be found, and
-what a named cause weighs beside it.
+The ridge uses features of layout and position. It names nothing and enters no model. It shows whether the
+residual has structure, and how large a named cause is in comparison.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from litho_models.models.features import Features, FeaturesConfig, RandomFeature
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# All rows of all scans; with more scans each is thinned.
+# Largest number of rows; with more scans each scan gets fewer.
 _KEPT_BYTES = 512 * 2**20
-# Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
+# Features whose strength may depend on order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6
+# µm.
 _VARYING = (18, 21, 22, 7)
 
 
 @dataclass(frozen=True)
 class Rest:
-    """What the learner explains of one residual, out of fold.
+    """The part of a residual that the ridge explains on held-out scans.
 
     Attributes:
-        gains_nm2: (scans,) taken from the squared error of each scan by the ridge that has not seen it.
-        squares_nm2: (scans,) the squared error itself; both free of what single scans may add.
+        gains_nm2: (scans,) squared error that the ridge removes from each held-out scan.
+        squares_nm2: (scans,) the squared error itself; both without the free terms of the scans.
     """
 
     gains_nm2: np.ndarray
@@ -48,7 +49,7 @@ class Rest:
 
     @property
     def share(self) -> float:
-        """Of the squared error."""
+        """Explained share of the squared error."""
         return self.mean_nm2 / max(float(self.squares_nm2.mean()), np.finfo(float).tiny)
 
     @cached_property
@@ -58,23 +59,23 @@ class Rest:
 
     @property
     def most_nm(self) -> float:
-        """The root of the upper end of the interval: what the form of the model may be wrong by, rms."""
+        """Root of the upper end of the interval: upper bound of the rms error of the model's form."""
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
-        """Whether something is left that can be learned: more than 1 %, and an interval without zero."""
+        """Whether the residual can be learned: by more than 1 %, with an interval that excludes zero."""
         low, _ = self.ci95_nm2 or (0.0, None)
         return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
-    """Feature rows of the scans of a study, made once; each residual then costs a few solves.
+    """Feature rows of the scans of a study, computed once for any number of residuals.
 
     Args:
         study: scans and folds.
-        predictions: (y, x) µm, one per scan: what a scan's own gain multiplies.
+        predictions: (y, x) µm, one per scan; the scan's free gain multiplies it.
     """
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
@@ -82,7 +83,7 @@ class Learner:
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
-        # By order, and by dose less its nominal value: both signs. Three of them, or nothing can follow them.
+        # Order, and dose minus nominal dose. A dependence needs at least three values.
         facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
@@ -98,7 +99,7 @@ class Learner:
         )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
-        """What the features explain of measured minus predicted, each scan by a ridge that has not seen it.
+        """Explain measured minus predicted heights of each scan by a ridge fitted to scans of other folds.
 
         Args:
             predictions: held-out predictions (y, x) µm, one per scan.
@@ -117,11 +118,11 @@ class Learner:
         return Rest(squares - left, squares)
 
     def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
-        """Features of layout and place, and some times order and dose, (m, n)."""
+        """Features of layout and position, and products of some with order and dose, (m, n)."""
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
-        # Height, ∂y and ∂x, whose strength may follow the place: a gain and a displacement.
+        # Height, ∂y and ∂x: a gain and a displacement whose strength may depend on position.
         placed = (18, 19, 20)
         columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
         for value in varied:
@@ -135,17 +136,17 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Mean squared residual (scans,) by ridges fitted, and their weight chosen, without each scan's fold."""
+    """Mean squared residual (scans,) of ridges fitted and regularised without each scan's fold."""
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
-    # Scans' worth of evidence for nothing to learn.
+    # Strength of regularisation, in scans.
     blocks = [Block(columns, ALL, shrinking) for shrinking in (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # A single scan has nothing to choose on: the most cautious.
+        # A single scan cannot choose a strength, so the largest is used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
@@ -154,7 +155,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
 
 
 def _all_features(scan: PreparedScan) -> Features:
-    """All features of the zoo, without the random ones, for scans like this one; weights are not fitted."""
+    """The layout features of the zoo's models, except random ones, for scans like this one."""
     first = scan.stored
     config = RandomFeaturesConfig.of_variant(
         pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
@@ -163,7 +164,7 @@ def _all_features(scan: PreparedScan) -> Features:
 
 
 def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
-    """Products of splines along y and x at flat indices of a scan, (25, n)."""
+    """Products of splines along y and x at flat indices of a scan, shape (25, n)."""
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
     return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
 
@@ -171,7 +172,7 @@ def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
 def _splines(size: int) -> np.ndarray:
     """Cubic splines (5, size) over the sampled part of an axis, constant beyond it; they add up to 1.
 
-    A spline that only pixels beyond it hold would be drawn there without having been measured.
+    Beyond the sampled part a spline would be determined by no measured pixel.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])

@@ -1,6 +1,6 @@
-"""What is seen in single scans directly, without a model: rounding, scars, short lines, bends.
+"""Marks seen directly in single scans, without a model: rounding, scars, short lines, bends.
 
-None of it lowers an error on held-out scans. It has evidence, and no place in the model.
+Marks are reported with evidence but enter no model, because they do not lower errors on held-out scans.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
-# Beyond the sharpness of tip and spot, and within the length of a line-shaped feature.
+# Longer than the resolution of tip and spot, shorter than a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
-# Less is there, and does not matter.
+# Smaller amounts exist but do not matter.
 _SMALLEST_RMS_NM = 0.5
 
 
 def marks(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], rounding_um: Mapping[str, float] | None
 ) -> list[ScanFinding]:
-    """All that is seen directly.
+    """Return all marks of the scans.
 
     Args:
-        scans: as they are; ``maps_um``: the maps (y, x) that they should show.
+        scans: original scans; ``maps_um``: their expected maps (y, x).
         rounding_um: step of the heights in each scan's raw file, by id; None without raw files.
     """
     residuals = [
@@ -42,10 +42,10 @@ def marks(
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
-    """Terms and marks, each name once: it is there if either says so."""
+    """Merge terms and marks by name; a name is seen if either list has seen it."""
     found = {one.name: one for one in findings}
     for mark in seen:
-        # The one that says so first.
+        # The first that has seen it counts.
         pair = sorted((found.get(mark.name, mark), mark), key=lambda one: not one.seen)
         evidence = "; ".join(dict.fromkeys(one.evidence for one in pair))
         found[mark.name] = pair[0].model_copy(update={"evidence": evidence})
@@ -53,10 +53,10 @@ def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> 
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Step of which all heights of a raw scan are multiples, up to one offset; 0 where there is none."""
+    """Common step of all heights of a raw scan, up to one offset; 0 if there is none."""
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
-    # Nearer ones are one value of a file that rounds in single precision.
+    # Smaller differences are rounding of single precision.
     steps = steps[steps > 1e-6 * np.ptp(heights)] if len(heights) > 2 else steps[:0]
     if not len(steps):
         return 0.0
@@ -66,7 +66,7 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
 
 
 def _rounding(steps_um: Sequence[float]) -> ScanFinding:
-    """Rounding of the raw files: uniform noise of step / √12."""
+    """Report the rounding of the raw files, which adds uniform noise of rms step / √12."""
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
     if not len(rounded):
@@ -80,23 +80,23 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
-    """Outliers drawn out along the scan lines, against those drawn out across them, scan by scan."""
+    """Report scars: more outliers are elongated along the scan lines than across them."""
     counts = np.array([_drawn_out(scan, own) for scan, own in zip(scans, residuals, strict=True)])
     along, across = counts.T
     p = one_sided_flip_p((along - across).astype(float))
-    text = f"{along.sum()} outliers drawn out along the lines and {across.sum()} across them (p = {p:.4f})"
+    text = f"{along.sum()} outliers elongated along the lines and {across.sum()} across them (p = {p:.4f})"
     return ScanFinding.of("scars-and-spikes", text, seen=p <= CONFIRM_P and along.sum() >= 10, p=p)
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
-    """Outliers that are long along the scan lines, and across them."""
+    """Numbers of outliers that are elongated along the scan lines, and across them."""
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
     sizes, along, across = np.bincount(numbered.ravel()), 0, 0
     for number, box in enumerate(find_objects(numbered), 1):
         height, width = (part.stop - part.start for part in box)
-        # On fewer pixels it is noise; a scratch is four times as long as wide.
+        # Fewer pixels are noise; a scratch is at least four times as long as wide.
         if sizes[number] >= 9:
             along += width >= 4 * height
             across += height >= 4 * width
@@ -106,9 +106,9 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
 def _short_lines(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
 ) -> ScanFinding:
-    """Residual that neighbours along a scan line share and neighbours across do not, in flat places.
+    """Report short lines: residual shared by neighbours along a scan line but not across, in flat places.
 
-    Slopes are left out: what a model misses there is not noise.
+    Slopes are left out, because model errors there are not noise.
     """
     shared = np.array([_shared_nm2(*one) for one in zip(scans, maps_um, residuals, strict=True)])
     along, across = shared.T
@@ -129,7 +129,7 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
     for line in (scan.line, row_index(flat.shape)):
-        # What this takes off too much makes neighbours along a line share less, not more.
+        # An error of this correction can only lower the shared part along a line.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )
@@ -150,7 +150,7 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Scans that registration found bent, and straightened: all else sees them without their bend."""
+    """Report scans that registration straightened; everything else uses the straightened scans."""
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:

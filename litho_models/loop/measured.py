@@ -1,4 +1,4 @@
-"""Printer and measurement: fitted together to scans, and scans freed of what a group of them shares."""
+"""Fit printer and measurement together, and free scans of what groups of them share."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from litho_models.scan_terms.measurement_fit import learn_measurement
 
 
 class Fit(NamedTuple):
-    """Printer and measurement fitted to the same scans."""
+    """A printer and a measurement model fitted to the same scans."""
 
     twin: Twin
     measurement: MeasurementModel
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """Fitted numbers of printer and measurement."""
+        """Number of fitted parameters of printer and measurement."""
         return len(self.twin.vector), self.measurement.numbers
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
@@ -33,9 +33,10 @@ class Fit(NamedTuple):
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
-    """The scans without what those of a group share beside their prints.
+    """Subtract from each scan what the scans of a group share in addition to their prints.
 
-    What all scans share stays in: a cause may have it. A scan is freed by what was learned without its fold.
+    What all scans share stays, because a cause may explain it. The subtracted part is learned without the
+    scan's fold.
     """
     study = state.study
     maps = state.maps_um(study.scans)
@@ -52,11 +53,11 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Printer and measurement fitted to the same scans, one after the other, and the strengths once more.
+    """Fit printer and measurement to the same scans in turn, then the strengths of effects again.
 
     Args:
-        twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
-        refit: the printer, once the measurement is known; or leave it where it is.
+        twin: start of the printer's fit; ``scans``: original scans.
+        refit: fit the printer again once the measurement is known.
     """
     stored = [scan.stored for scan in scans]
     maps = [twin.height(scan) for scan in scans]

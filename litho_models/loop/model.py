@@ -1,4 +1,4 @@
-"""The twin: a base model with effects, each with one strength for all scans or one for each group of them."""
+"""The twin: a base model with effects whose strength is the same for all scans or differs by group."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = Mapping[str, Mapping[str, float]]
-# How near a fitted number is to a bound that it stands on, of its size.
+# Relative distance from a bound below which a fitted value counts as on the bound.
 _AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One fitted number of an effect; ``label``: the group that has it, None for all scans."""
+    """One fitted parameter of an effect; ``label``: its group of scans, None for all scans."""
 
     effect: str
     parameter: str
@@ -36,7 +36,7 @@ class Slot:
 
     @property
     def facts(self) -> Parameter:
-        """What the catalogue says of the number."""
+        """The catalogue's entry for this parameter."""
         return get_effect(self.effect).parameters[self.parameter]
 
 
@@ -44,15 +44,15 @@ class Slot:
 class Added:
     """An effect in a model.
 
-    ``by``: the grouping in which its amplitudes differ, ``all`` for one strength; ``values``: of all its
-    parameters by label, ``""`` for all scans.
+    ``by``: the grouping in which its amplitudes differ, ``all`` for one strength; ``values``: its parameters
+    by label, ``""`` for all scans.
     """
 
     by: str
     values: Values
 
     def of(self, label: str | None) -> dict[str, float]:
-        """The parameters of a group; of one that was never fitted the mean of those that were."""
+        """The parameters of a group; for a group that was never fitted, the mean of the fitted ones."""
         if label is not None and label in self.values:
             return dict(self.values[label])
         first = next(iter(self.values.values()))
@@ -61,13 +61,13 @@ class Added:
 
 @dataclass(frozen=True)
 class Twin:
-    """Base and effects with their numbers; a fit moves ``vector`` and leaves the rest.
+    """A base model and effects with their parameters. Fits change only ``vector``.
 
     Attributes:
-        base: the model of the printer; its own numbers are refitted if they are few.
-        numbers: those of the base.
-        effects: in the order in which they came.
-        frames: what an effect turns with, where it is not what the catalogue says; see ``EffectChain``.
+        base: the model of the printer; its parameters are refitted if they are few.
+        numbers: fitted parameters of the base.
+        effects: in the order in which they were added.
+        frames: what an effect turns with, if it differs from the catalogue; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -80,22 +80,24 @@ class Twin:
 
     @classmethod
     def bare(cls, base: nn.Module) -> Twin:
-        """The base alone."""
+        """A twin without effects."""
         return cls(base, _numbers(base))
 
     @property
     def own(self) -> int:
-        """How many of the numbers are the base's."""
+        """The number of fitted parameters of the base."""
         return len(self.numbers)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The effects, as they act."""
+        """Names of the effects, in the order in which they act."""
         return tuple(in_forward_order(list(self.effects)))
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """The fitted numbers of the effects, in the order of ``vector``, after those of the base."""
+        """The fitted parameters of the effects, in the order of ``vector``, where they follow those of the
+        base.
+        """
         return [
             Slot(name, key, label)
             for name, one in self.effects.items()
@@ -106,12 +108,12 @@ class Twin:
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """All fitted numbers."""
+        """All fitted parameters, those of the base first."""
         of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
         return np.concatenate([self.numbers, of_slots])
 
     def at(self, vector: np.ndarray) -> Twin:
-        """The same with other numbers."""
+        """The same twin with other parameters."""
         values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
         for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
             for label, own in values[slot.effect].items():
@@ -121,28 +123,28 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """The same over a base that has not seen the fold, where one was trained without each."""
+        """The same effects over the base trained without this fold, if there is one."""
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
     def with_effect(self, name: str, by: str, values: Values) -> Twin:
-        """One effect more, with starting values by label (``""`` for all scans)."""
+        """Add an effect with starting values by label (``""`` for all scans)."""
         return replace(self, effects={**self.effects, name: Added(by, values)})
 
     def only(self, names: Collection[str]) -> Twin:
-        """The same with no other effects than these."""
+        """Keep only these effects."""
         return replace(self, effects={name: one for name, one in self.effects.items() if name in names})
 
     def without(self, name: str) -> Twin:
-        """The same without one of its effects."""
+        """Remove one effect."""
         return self.only({*self.effects} - {name})
 
     def alone(self) -> Twin:
-        """The same without any effect."""
+        """Remove all effects."""
         return self.only(())
 
     def ungrouped(self) -> Twin:
-        """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
+        """Replace strengths by group by their mean; parameters in the order in which effects act."""
         effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
         return replace(self, effects=effects)
 
@@ -151,13 +153,15 @@ class Twin:
         return replace(self, base=base, numbers=_numbers(base))
 
     def with_base_unfitted(self) -> Twin:
-        """The same with the base as it is before any fit."""
+        """Reset the base to its default values."""
         if not (self.own and isinstance(self.base, Simulator)):
             return self
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
     def values(self, label_in: Mapping[str, str]) -> dict[str, dict[str, float]]:
-        """Parameter values of all effects, as they act, for the scans with these labels, by grouping."""
+        """Parameter values of all effects, in the order in which they act, for scans with these labels by
+        grouping.
+        """
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
@@ -165,13 +169,13 @@ class Twin:
         return {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
-        """Whether a number is one of the scan's own group, or of all scans."""
+        """Whether a parameter belongs to the scan's group or to all scans."""
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """The same with nothing but these scans behind it.
+        """Restrict strengths by group to the groups of these scans.
 
-        A strength of a group that none of them is in becomes the mean of the other groups' strengths.
+        The strength of any other group becomes the mean of theirs.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -185,7 +189,7 @@ class Twin:
 
     @cached_property
     def fitted_base(self) -> nn.Module:
-        """The base at its numbers: a copy of its own, where it has any."""
+        """The base with its fitted parameters; a copy if it has any."""
         if not self.own:
             return self.base
         base = copy.deepcopy(self.base)
@@ -193,7 +197,7 @@ class Twin:
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
-        """The chain of effects as it is for one scan, or with mean strengths; ``extra``: tried on top."""
+        """The chain of effects for one scan, or with mean strengths; ``extra``: a further effect to try."""
         labels = {} if scan is None else self.labels(scan)
         key = tuple(labels.values())
         if extra or key not in self._chains:
@@ -206,12 +210,12 @@ class Twin:
 
     @torch.no_grad()
     def exposed(self, scan: PreparedScan) -> Tensor:
-        """The layout (1, 1, y, x), µm, with the effects that act on it."""
+        """The layout (1, 1, y, x), µm, after the effects that act on it."""
         return self.chain(scan).before_base(scan.context.layout_um, scan.context)
 
     @torch.no_grad()
     def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
-        """Height (1, 1, y, x), µm, of the base alone on what is exposed (1, 1, y, x), µm."""
+        """Height (1, 1, y, x), µm, that the base alone predicts for an exposed layout (1, 1, y, x), µm."""
         base = self.fitted_base
         return (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
 
@@ -219,21 +223,21 @@ class Twin:
     def height(
         self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
     ) -> np.ndarray:
-        """Predicted height of the print (y, x), µm; ``base_um``: that of the base, where it is known."""
+        """Predicted height of the print (y, x), µm; ``base_um``: prediction of the base, if known."""
         chain = self.chain(scan, extra)
         if base_um is None:
             base_um = self.base_height(chain.before_base(scan.context.layout_um, scan.context), scan)
         return chain.after_base(base_um, scan.context)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
+        """Steps (p,) of difference quotients, upwards except at an upper limit."""
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
         effects = np.where(self.vector[self.own :] + size <= upper, size, -size)
         return np.concatenate([5e-3 * np.maximum(np.abs(own), 0.2), effects])
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest step (p,) allowed from here: base and effects within their ranges."""
+        """Smallest and largest step (p,) that keep base and effects within their ranges."""
         lower, upper, _ = self._ranges()
         own, effects = self.vector[: self.own], self.vector[self.own :]
         lowest, highest = parameter_room(self.base, own) if self.own else (own, own)
@@ -243,29 +247,29 @@ class Twin:
         )
 
     def _ranges(self) -> np.ndarray:
-        """Of each effect's number lower bound, upper bound and usual size, (3, slots)."""
+        """Lower bound, upper bound and usual size of each effect parameter, (3, slots)."""
         facts = [slot.facts for slot in self.slots]
         nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
         known = [
-            # What is zero as a rule, as an angle, has a tenth of its range for a usual size.
+            # A parameter that is usually zero, such as an angle, gets a tenth of its range as usual size.
             (one.lower, one.upper, abs(one.typical - null) or 0.1 * (one.upper - one.lower))
             for one, null in zip(facts, nulls, strict=True)
         ]
         return np.array(known).reshape(-1, 3).T
 
     def free(self) -> np.ndarray:
-        """True for numbers (p,) with room on both sides."""
+        """True for parameters (p,) that are not on a bound."""
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
     def at_bounds(self) -> dict[str, float]:
-        """Fitted values of base and effects that stand on a bound of their range, and that bound."""
+        """Fitted values of base and effects that lie on a bound of their range, with that bound."""
         base = self.fitted_base
         found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
-        """Amplitudes of an effect that some group has at a limit of their range other than the null."""
+        """Amplitudes of an effect that lie on a limit of their range, other than the null, in some group."""
         own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
         beyond = (slot for slot, at in own if slot.facts.kind == "amplitude" and at != slot.facts.null)
         return [*dict.fromkeys(slot.parameter for slot in beyond)]
@@ -280,7 +284,7 @@ class Twin:
 
 
 def is_refitted(base: nn.Module) -> bool:
-    """Whether the base has parameters, and few enough to be fitted together with the effects."""
+    """Whether the base has few enough parameters to be fitted together with the effects."""
     trainable = any(p.requires_grad for p in base.parameters())
     return trainable and is_small(base) and not isinstance(base, FoldedBase)
 

@@ -1,4 +1,4 @@
-"""How small an effect would be found here: plant it in copies of these scans and close the loop on them."""
+"""Plant an effect in copies of the scans and test whether the loop finds it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from litho_models.loop.record import Planted
 
 
 def parse_planted(text: str) -> tuple[Effect, float]:
-    """Effect and amount from ``NAME=AMOUNT``, the amount in the unit of its first amplitude.
+    """Parse ``NAME=AMOUNT`` into effect and amount, in the unit of the effect's first amplitude.
 
     Raises:
-        InputError: another form, an unknown effect, one that differs from scan to scan, or no number.
+        InputError: another form, an unknown effect, a per-scan effect, or no number.
     """
     name, separator, number = text.partition("=")
     effect = get_effect(name.strip())
@@ -39,11 +39,11 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 def plant(
     effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> Planted:
-    """Plant an effect beside the base in copies of the scans, and see what a new loop names.
+    """Plant an effect in copies of the scans, and report what a new loop names.
 
     Args:
-        effect, amount: of ``parse_planted``; ``closed``: what was found on the scans as they are.
-        close_again: the same loop on other scans.
+        effect, amount: from ``parse_planted``; ``closed``: result of the loop on the original scans.
+        close_again: runs the same loop on other scans.
     """
     amplitude = effect.amplitudes[0]
     values = {effect.name: {**effect.off_values(), amplitude: amount}}

@@ -1,4 +1,4 @@
-"""Scans prepared for the loop: tensors, pixels to compute on, and what is known of their place."""
+"""Prepare scans for the loop: tensors, sampled pixels, and position."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# Fits and screening of scans this large see one quadrant, and a margin around it.
+# For scans of this size or larger, fits and screening use one quadrant with a margin.
 LARGE_PX = 400
 
 
@@ -26,12 +26,12 @@ class PreparedScan:
     """One scan ready to be predicted and compared.
 
     Attributes:
-        stored: the scan as it lies in the store.
-        context: its place, for the effects, and what is exposed.
-        sample: flat indices of thinned usable pixels away from the edge; fitted and screened.
+        stored: the scan in the store.
+        context: its position and exposed layout, for the effects.
+        sample: flat indices of the pixels for fits and screening, thinned and away from the edge.
         height: measured height at ``sample``, float64 µm.
         line: index of the scan line under each pixel (y, x).
-        quadrant: part of a large scan that stands for it in fits and screening; see ``window``.
+        quadrant: part of a large scan that fits and screening use; see ``window``.
     """
 
     stored: PrintedScan
@@ -43,7 +43,7 @@ class PreparedScan:
 
     @cached_property
     def usable(self) -> np.ndarray:
-        """Measured pixels, bool (y, x); scored."""
+        """Measured pixels, bool (y, x), which are scored."""
         return self.stored.usable
 
     @property
@@ -55,21 +55,21 @@ class PreparedScan:
         return self if self.quadrant is None else self.quadrant
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
-        """Values of a (…, y, x) map at the thinned pixels, float64."""
+        """Values of a (…, y, x) map at the sampled pixels, float64."""
         flat = field_map.detach().cpu().numpy() if isinstance(field_map, Tensor) else field_map
         return flat.reshape(-1)[self.sample].astype(np.float64)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
-        """Smooth scan terms at the thinned pixels, (k, n)."""
+        """Smooth scan terms at the sampled pixels, (k, n)."""
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
     def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
-        """Orthonormal basis (n, k) of what the scan may add to a prediction (y, x), µm, by itself."""
+        """Orthonormal basis (n, k) of the scan's free terms at a prediction (y, x), µm."""
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
-    """Prepare all scans of a store; places in the writing order are scaled over these scans.
+    """Prepare all scans of a store, with positions in the writing order scaled to these scans.
 
     Raises:
         InputError: no scan.
@@ -83,7 +83,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Scans prepared with places in the writing order of those that a model is known from."""
+    """Prepare further scans, with positions in the writing order of the scans that a model was fitted to."""
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
     def placed(scan: PreparedScan) -> PreparedScan:
@@ -96,7 +96,7 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
     dose = 1.0 if scan.dose is None else float(scan.dose)
-    # Level times dose is the exposure: to all that follows, less dose is a lower layout.
+    # Exposure is level times dose, so less dose acts like a lower layout.
     layout = torch.from_numpy(scan.layout_um * np.float32(dose))[None, None]
     write = scan.write or {}
     line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
@@ -119,7 +119,7 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
-    """Large scans get a window: scans take their four quadrants in turn, so that all places are covered."""
+    """Give large scans a window; scans take the four quadrants in turn to cover the whole field."""
     shape, pitch = scan.stored.shape, scan.stored.pitch_um
     if min(shape) < LARGE_PX:
         return scan
@@ -151,7 +151,7 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
 
 
 def _half(size: int, second: bool) -> tuple[slice, slice]:
-    """Half of an axis with a margin of 48 pixels towards the other half, and without."""
+    """Half of an axis, with and without a margin of 48 pixels towards the other half."""
     middle = size // 2
     if second:
         return slice(middle - 48, size), slice(middle, middle + size // 2)
@@ -159,10 +159,10 @@ def _half(size: int, second: bool) -> tuple[slice, slice]:
 
 
 def sample_border_px(size: int) -> int:
-    """Pixels at either end of an axis of this shortest length that are not sampled.
+    """Number of pixels at each end of an axis that are not sampled; ``size``: the shortest axis.
 
-    They see a neighbourhood that the layout does not hold. Errors are scored on all pixels, as in the
-    benchmark (``Blocks.border_px``).
+    Their neighbourhood extends beyond the layout. Errors are scored on all pixels, as in the benchmark
+    (``Blocks.border_px``).
     """
     return min(8, size // 8)
 
@@ -173,6 +173,6 @@ def _inner(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _thinned(scan: PrintedScan, context: FieldContext, sampled: np.ndarray, line: LineIndex) -> PreparedScan:
-    # About as many pixels as carry independent information: residuals correlate over ~5 px.
+    # Residuals correlate over about 5 px, so denser sampling would add little information.
     sample = thinned(sampled, 16384)
     return PreparedScan(scan, context, sample, scan.height_um.reshape(-1)[sample].astype(np.float64), line)

@@ -1,4 +1,4 @@
-"""``close_loop.json``, schema 4: what was found, written once; report and tables read it."""
+"""``close_loop.json``, schema 4: the record of a loop, from which report and tables are drawn."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ MeasuredBy = Literal["print alone", "published", "shared"]
 
 
 class ErrorRow(Record):
-    """Error of one model on scans held out from it.
+    """Error of one model on held-out scans.
 
     Attributes:
-        model: the base, with its causes, with all that was found (``all``, the corrected model).
-        measurement: what is added to the print: nothing, the smooth background that training scans share (the
-            published protocol), or the whole measurement model.
-        policy: terms of each scan, ``k`` of them, fitted on pixels that are not scored.
-        held_out: folds of scans, or whole prints; nested where everything was chosen anew without them.
-        printer_numbers: fitted numbers of the model; ``measurement_numbers``: of the measurement, the largest
-            of any fold.
-        edge_by_scan_nm: mean distance of the edges, of films.
+        model: the base, the base with causes, or ``all``, the corrected model.
+        measurement: added to the print: nothing, the smooth background of the training scans (the published
+            protocol), or the whole measurement model.
+        policy: the ``k`` terms fitted to each scan, on pixels that are not scored.
+        held_out: folds of scans, or whole prints; nested if all choices were made without them.
+        printer_numbers: fitted parameters of the model; ``measurement_numbers``: of the measurement, the most
+            in any fold.
+        edge_by_scan_nm: mean distance of the edges, for films.
     """
 
     model: Stage
@@ -62,23 +62,25 @@ class ErrorRow(Record):
 
     @property
     def leading_by_scan_nm(self) -> dict[str, float]:
-        """The error that counts: of the edges of films, of all heights otherwise."""
+        """The leading error by scan: of edges for films, of heights otherwise."""
         return self.edge_by_scan_nm or self.by_scan_nm
 
     @property
     def leading_nm(self) -> float:
-        """Its mean over the scans."""
+        """Mean of the leading error over scans."""
         return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
 
     @property
     def is_headline(self) -> bool:
-        """Whether it is the one that is quoted: k = 1 (films 0), the shared measurement, folds of scans."""
+        """Whether this row is the quoted one: k = 1 (films: 0), shared measurement, folds of scans."""
         usual = usual_policy(bool(self.edge_by_scan_nm))
         return (self.policy, self.measurement, self.held_out) == (usual, "shared", "scans")
 
 
 class Strength(Record):
-    """A fitted number: its value for one label, and its interval over prints (over scans without prints)."""
+    """A fitted parameter for one label, with its interval over prints, or over scans if no prints are
+    known.
+    """
 
     label: str
     value: float
@@ -92,12 +94,12 @@ class FoundEffect(Record):
     Attributes:
         by: the grouping in which its strength differs; ``all`` for one strength.
         strengths: parameter to its numbers.
-        gain_nm2: what it takes from the squared error of held-out scans, the rest in place; scans and pixels
-            as they are fitted, free of seven terms and an affine shift per scan.
-        left_out_nm: by how much the mean absolute error grows when it is left out (k = 1).
-        family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        reshaped_share: what its change in other shapes would take beside it, of its own gain.
-        survives_on: bases on which it is confirmed as well.
+        gain_nm2: decrease of the squared error of held-out scans beside everything else, on the fitted
+            pixels, without seven terms and an affine shift per scan.
+        left_out_nm: increase of the mean absolute error without it (k = 1).
+        family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
+        reshaped_share: further gain by variants of its change, as a share of its own gain.
+        survives_on: other bases beside which the search also found it.
     """
 
     name: str
@@ -122,7 +124,7 @@ class FoundEffect(Record):
 
 
 class Candidate(Record):
-    """An effect that was not added, and why."""
+    """An effect that was not added, with the reason."""
 
     name: str
     verdict: CandidateVerdict
@@ -132,12 +134,12 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """What single scans add, each its own, or what is seen in them directly; no model has it.
+    """A term or mark that differs from scan to scan; it enters no model.
 
     Attributes:
-        seen: whether it is there; ``evidence``: in a sentence; ``p``: of its test.
+        seen: whether it was found; ``evidence``: a sentence; ``p``: p of its test.
         spread: parameter to its standard deviation over scans.
-        confusable_with: what these scans cannot tell from it.
+        confusable_with: effects that look the same in these scans.
     """
 
     name: str
@@ -151,7 +153,7 @@ class ScanFinding(Record):
 
     @classmethod
     def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
-        """With title and role of the catalogue, where it has the name and nothing else is said."""
+        """Make a finding, by default with title and role of the catalogue."""
         effect = CATALOGUE.get(name)
         role = effect.role if effect else "measurement"
         known = {"title": effect.title if effect else name, "role": role, **facts}
@@ -159,10 +161,10 @@ class ScanFinding(Record):
 
 
 class Planted(Record):
-    """An effect that was planted in copies of the scans: its amount, what it changes, what was found.
+    """An effect planted in copies of the scans, and what the loop found there.
 
-    ``rms_nm``: of the change, free of what single scans may add; ``named``: the set that it is in, empty if
-    it was not found; ``found``: its amount there.
+    ``rms_nm``: rms of its change without the scans' free terms; ``named``: the reported set that contains it,
+    empty if none does; ``found``: the fitted amount.
     """
 
     name: str
@@ -174,7 +176,9 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """What features of layout and place still explain out of fold, nm²; ``matters``: beyond chance."""
+    """Squared error (nm²) of held-out scans that features of layout and position still explain; ``matters``:
+    beyond chance.
+    """
 
     stage: str
     squared_error_nm2: float
@@ -183,9 +187,10 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """Two answers on new prints: by how much the first is nearer, in nm² and in standard deviations.
+    """Two answers compared on new prints: by how much the first fits better, in nm² and in standard
+    deviations.
 
-    ``z`` is less what the form of the model may have made of it; ``difference_nm``: between the two, rms.
+    ``z`` allows for an error in the model's form; ``difference_nm``: rms difference of the two predictions.
     """
 
     better: str
@@ -196,7 +201,7 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """A question that was open, and what new prints say: the answers declared before, and those left."""
+    """An open question after new prints: the answers declared before, and those that remain."""
 
     question: str
     kind: str
@@ -210,12 +215,12 @@ class Decision(Record):
 
 
 class CloseLoop(Result):
-    """What the loop found.
+    """The record of a loop.
 
-    ``errors``: see ``ErrorRow``; ``gain``: base minus all, k = 1, with the shared measurement, over scans and
-    over prints. ``chosen``: in nested selections, how often each effect was chosen. ``confounded``: fitted
-    numbers that these scans determine together only, with their correlation. ``decisions``: of further
-    stores, about what was open on the first.
+    ``errors``: see ``ErrorRow``; ``gain``: error of the base minus that of the corrected model, k = 1, with
+    the shared measurement, over scans and over prints. ``chosen``: how often nested selections chose each
+    effect. ``confounded``: pairs of parameters that these scans cannot determine separately, with their
+    correlation. ``decisions``: answers of further stores to open questions of the first.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -253,7 +258,7 @@ class CloseLoop(Result):
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """One row of the errors, with the usual terms unless stated; None if it was not measured."""
+        """One row of the errors, by default with the usual terms; None if it was not measured."""
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)

@@ -1,4 +1,4 @@
-"""The report of a loop for people, drawn from its record: the answer, pictures, tables."""
+"""Draw the report of a loop from its record."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
-    """Write ``report.html`` and its tables; ``maps``: residual (y, x), nm, by scan, before and after."""
+    """Write ``report.html`` and its tables; ``maps``: residuals (y, x), nm, by scan, before and after."""
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",
         "From the residual on held-out scans to causes and laws, to a corrected model.",
@@ -79,7 +79,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
 
 
 def said(about: str, one: object) -> str:
-    """A ``verdict`` (of a result), ``effect``, ``decision``, ``measurement`` or other macro, in words."""
+    """Render a macro such as ``verdict`` (of a result), ``effect``, ``decision`` or ``measurement``."""
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 

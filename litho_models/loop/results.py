@@ -1,4 +1,4 @@
-"""From what was found to its record: errors side by side, strengths with intervals, reasons for the rest."""
+"""Make the record of a loop: errors, strengths with intervals, reasons for rejected effects."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def record(
     *,
     single_scans: list[ScanFinding],
     left_out_nm: Mapping[str, float],
-    survives_on: Mapping[str, list[str]],
     **given: Any,
 ) -> CloseLoop:
-    """The record of one run.
+    """Make the record of one run.
 
     Args:
-        closed: what was found; ``errors``: of ``error_rows``; ``single_scans``: what those add.
-        left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
+        closed: result of ``close``; ``errors``: rows of ``error_rows``; ``single_scans``: findings in single
+            scans.
+        left_out_nm: by effect, see ``FoundEffect``; ``given``: further fields of the record.
     """
     study, final = closed.study, closed.final.twin
-    effects = [_found(closed, one, left_out_nm[one.name], survives_on[one.name]) for one in closed.found]
+    effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
     before, after = (
         next(row.leading_by_scan_nm for row in errors if row.is_headline and row.model == model)
         for model in ("base", "all")
@@ -99,7 +99,7 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """The base's numbers by their physical names, as it holds them; empty for a base that is not fitted."""
+    """The base's values by their physical names; empty for a base that is not fitted."""
     base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
         return {}
@@ -113,12 +113,12 @@ def _values(twin: Twin) -> dict[str, float]:
     return found
 
 
-def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[str]) -> FoundEffect:
+def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
-    # What another base does not need corrects the form of this one.
-    corrects = effect.knowledge == "cause" and not {*closed.others} <= {*survives_on}
+    # A cause that another base does not need may only correct this base.
+    corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
         name=cause.name,
@@ -139,12 +139,12 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float, survives_on: list[s
         group_p=cause.group_p,
         reshaped_share=cause.reshaped_share,
         left_out_nm=left_out_nm,
-        survives_on=survives_on,
+        survives_on=closed.survives_on(cause),
     )
 
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for."""
+    """Fitted values of an effect, with intervals from the scatter over prints (or scans)."""
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
@@ -161,16 +161,16 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """The unit that each scan belongs to in an interval: its print, or itself where prints are too few."""
+    """The unit of each scan for intervals: its print, or the scan itself if there are too few prints."""
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
 
 
 def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
-    """Covariance (p, p) of fitted numbers, by what each unit asks for at the optimum.
+    """Cluster-robust covariance (p, p) of fitted parameters.
 
     Args:
-        linear: each window there; ``units``: the print, or the scan, that each belongs to.
+        linear: each window at the optimum; ``units``: the print or scan of each.
     """
     parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
@@ -183,7 +183,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 
 
 def confounded(state: State) -> list[tuple[str, str, float]]:
-    """Pairs of fitted numbers that these scans determine together only, with their correlation."""
+    """Pairs of parameters that these scans cannot determine separately, with their correlation."""
     twin = state.twin
     normal = eliminated_sum(state.linear, RULES.term_weight)[0]
     free = np.flatnonzero(np.diag(normal) > 0)
@@ -199,7 +199,7 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
-    """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
+    """Why each other effect was not added; ``seen``: per-scan effects, which are listed elsewhere."""
     sets = {other: one.name for one in added for other in one.confusable_with}
     films, first, last = closed.study.of_films, closed.named.first, closed.named.last
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
@@ -238,7 +238,7 @@ def _refused(
     if last.beside_base < SMALLEST_RETAINED:
         return "not-testable", "on these layouts it changes nothing that single scans do not"
     if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-        return "absorbed", "numbers of the base do the same: its fit has taken it up"
+        return "absorbed", "the base has absorbed it: its own values do the same"
     if not last.allowed and named.first[name].family_p <= FAMILY_P:
         return "contradicted", "its best strength has the wrong sign"
     gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"

@@ -1,4 +1,4 @@
-"""One run of the loop on a store: record, report, tables and the corrected model in one folder."""
+"""Run the loop on a store and write record, report, tables and the corrected model."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
 Nested = Literal["folds", "prints"]
-# What is made of a closed loop before it is written: its record, and records to be written beside it.
+# Maps a closed loop and its record to the record to write and further records beside it.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
 
 
@@ -55,22 +55,22 @@ def close_loop(
     decided_by: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
-    """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
+    """Close the loop on a dataset store and write the result to ``out``, which appears when complete.
 
     Args:
         store: made by ``litho-data build``.
         base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
         base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
-        folds: of scans; each scan is predicted by fits that have not seen its fold.
-        nested: also choose everything anew without each fold, or each print, and judge it there.
-        inject: ``NAME=AMOUNT`` each, planted in copies of the scans: is it found?
+        folds: number of folds; each scan is predicted by fits without its fold.
+        nested: also repeat all choices without each fold, or each print, and judge them on it.
+        inject: effects as ``NAME=AMOUNT``, each planted in copies of the scans to see whether it is found.
         open_lock_box: also score the locked scans.
-        steps: optimiser steps of a network, which is trained without each fold; its recipe's by default.
-        cache: folder where such trainings are kept and continued, by default beside ``out``.
-        seed: of folds, calibration blocks and permutations.
+        steps: optimiser steps of a network, by default those of its recipe; it is trained without each fold.
+        cache: folder that keeps such trainings, by default beside ``out``.
+        seed: seed of folds, calibration blocks and permutations.
         workers: local processes; ``dask``: address of a Dask scheduler instead.
-        further: called before anything is written; ``decided_by``: hashes of the stores that it asks.
-        report: told what happens, a sentence at a time.
+        further: called before anything is written; ``decided_by``: hashes of the further stores that it uses.
+        report: gets progress messages.
 
     Raises:
         InputError: no store, an unknown base, too few usable scans, or a nested selection of a base that is
@@ -104,7 +104,7 @@ def close_loop(
             return close(study.of_others(scans), own)
 
         models = HeldOut(closed)
-        errors, left_out_nm, survives_on = models.errors(), models.left_out_nm(), models.survives_on()
+        errors, left_out_nm = models.errors(), models.left_out_nm()
         planted = [plant(*one, closed, close_again) for one in wanted]
         often: dict[str, int] = {}
         if nested:
@@ -115,7 +115,7 @@ def close_loop(
         alone: list[ScanFinding] = []
         residuals = models.residuals()
         if not study.of_films:
-            report("looking at what single scans add")
+            report("looking for terms of single scans")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, study.scans, maps).findings()
             alone = with_marks(terms, marks(study.scans, maps, _rounding_um(opened, development)))
@@ -124,7 +124,6 @@ def close_loop(
             errors,
             single_scans=alone,
             left_out_nm=left_out_nm,
-            survives_on=survives_on,
             run=run_info([seed], len(development), dropped),
             dataset=opened.dataset_id,
             measurement=models.fit(closed.final).measurement,
@@ -143,10 +142,10 @@ def close_loop(
 
 
 def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
-    """Scans to develop on, locked ones, and those left out with the reason.
+    """Return development scans, locked scans, and excluded scans with reasons.
 
     Raises:
-        InputError: fewer than two to develop on.
+        InputError: fewer than two development scans.
     """
     scans = store.scans()
     dropped = [scan.id for scan in scans if np.count_nonzero(scan.usable) < 1024]
@@ -162,7 +161,9 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """All chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
+    """Repeat all choices without each fold, or print, and judge them there; also count how often each effect
+    was chosen.
+    """
     scans = [scan.stored for scan in study.scans]
     ids = [scan.id for scan in scans]
     parts = (
@@ -183,7 +184,7 @@ def _nested(
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
-    """Step of the heights in the raw file of each scan; None where the store has no raw files."""
+    """Rounding step of the heights in the raw file of each scan; None if the store has no raw files."""
     try:
         return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
     except InputError:

@@ -1,4 +1,4 @@
-"""What a loop leaves for others: the corrected model of the printer, and the laws as a module."""
+"""Save the corrected model of the printer, and the laws as a module."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODEL_FOLDER, LAWS_FILE = "model", "laws.py"
 
 
 def save_laws(result: CloseLoop, folder: Path) -> None:
-    """Write a module that registers the laws that were found as effects; nothing where there is none."""
+    """Write a module that registers the laws as effects, if there are any."""
     laws = [one for one in result.effects if one.knowledge == "law"]
     if not laws:
         return
@@ -27,7 +27,7 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
-    """The corrected model of the printer, with the strengths that the latest scan has."""
+    """Save the corrected model of the printer, with the strengths of the latest scan."""
     twin = closed.final.twin
     base = twin.fitted_base
     if isinstance(base, FoldedBase):

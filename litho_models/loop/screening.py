@@ -1,7 +1,8 @@
-"""What each candidate would gain on held-out scans, from its derivative at the model so far.
+"""Predict the held-out gain of every candidate from its derivative at the current model.
 
 A candidate is a set of columns: secants of an effect at some of its parameters, or maps along a covariate.
-Its strength is one for all scans or one by group. Of each scan only inner products are needed.
+Its strength is common to all scans or differs by group. The computation needs only inner products from each
+scan.
 """
 
 from __future__ import annotations
@@ -21,25 +22,26 @@ from litho_models.loop.trials import Secants, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
-# Of a direction's information, what must survive the projections for a test to mean anything.
+# Smallest share of a direction's information that the projections must leave for a valid test.
 SMALLEST_RETAINED = 1e-5
-# Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
+# Share of the smallest useful gain, because derivatives predict the gain of a fit to a factor of three.
 WORTH_FITTING = 0.3
 PERMUTATIONS = 199
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A trial with a way in which its strength goes, and what it gains on scans held out.
+    """A trial with a grouping of its strength, and its predicted gain on held-out scans.
 
     Attributes:
-        trial: what is tried; ``by``: the grouping of its strength.
-        gains_nm2: (scans,) in squared error, strengths fitted without the scan's fold.
-        multiples: by label, of the trial's amplitudes, from all scans.
-        allowed: the strengths have a physical sign; ``retained``: share of the information that the terms of
-            single scans and the model's own numbers leave, ``beside_base``: what the terms alone leave.
-        family_p: share of flips of the signs of the scans in which the largest gain of any candidate reaches
-            this one's; ``group_p``: of exchanges of the scans, where a grouping was held against them.
+        trial: the tried parameters; ``by``: the grouping of the strength.
+        gains_nm2: (scans,) decrease of the squared error, with strengths fitted without the scan's fold.
+        multiples: fitted multiples of the trial's amplitudes by label, from all scans.
+        allowed: whether the strengths have a physical sign; ``retained``: share of the information left after
+            projecting out scan terms and the model's own parameters, ``beside_base``: after the scan terms
+            alone.
+        family_p: share of sign flips of the scans in which any candidate gains at least as much; ``group_p``:
+            share of permutations of the scans, if a grouping was tested.
     """
 
     trial: Trial
@@ -62,20 +64,21 @@ class Screened:
 
     @property
     def numbers(self) -> int:
-        return len(self.trial.sets) * len(self.multiples)
+        shapes = sum(facts.kind == "shape" for facts in self.trial.effect.parameters.values())
+        return len(self.trial.sets) * len(self.multiples) + shapes
 
     def start(self) -> dict[str, dict[str, float]]:
-        """Values by label from which a fit begins."""
+        """Starting values of a fit, by label."""
         return {label: self.trial.start(own) for label, own in self.multiples.items()}
 
 
 class Screening:
-    """Secants of all trials, and their inner products with what a fitted state leaves.
+    """Secants of all trials, and their inner products with the residual of a fitted model.
 
     Args:
-        state: the model so far; ``effects``: candidates, none of them in the model.
-        secants: at another model, near enough to tell what is worth fitting; by default at the state.
-        kept: numbers of the model that residual and columns are not freed of.
+        state: the current model; ``effects``: candidates that it does not contain.
+        secants: taken at a similar model; by default at the state.
+        kept: parameters of the model that are not projected out.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class Screening:
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """The candidates that stand out, each with its best grouping, the largest gain first."""
+        """The significant candidates, each with its best grouping, largest gain first."""
         standing = []
         for own in self.candidates.values():
             grouped = self._grouped(own)
@@ -140,7 +143,7 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """The best grouping, if it gains more than chance over one strength for all scans, or None."""
+        """The best grouping, or None if it gains no more than chance over a common strength."""
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
         best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})
@@ -151,13 +154,13 @@ class Screening:
         return replace(one, group_p=p) if p <= EXCHANGED_P else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
-        """Alignment of what two candidates change, pooled over scans."""
+        """Cosine of the angle between the changes of two candidates, pooled over scans."""
         one, other = self._change(a), self._change(b)
         inner = np.einsum("asi,sij,bsj->ab", [one, other], self.freed, [one, other], optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _change(self, one: Screened) -> np.ndarray:
-        """Multiples of all columns, (scans, columns), in what a candidate changes."""
+        """Multiples of all columns, (scans, columns), in the change of a candidate."""
         found = np.zeros(self.freed.shape[:2])
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
@@ -183,10 +186,11 @@ class Screening:
         columns: Sequence[int],
         taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Held-out gains (scans,) nm² of some columns with strengths by label, and those from all scans.
+        """Held-out gains (scans,), nm², of some columns with strengths by label; also the strengths from all
+        scans.
 
         Args:
-            taken: share of the strengths that is taken.
+            taken: factor on the strengths.
         """
         own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
         scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
@@ -204,9 +208,9 @@ class Screening:
         return gains * NM_PER_UM**2, multiples
 
     def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
-        """Share of exchanges of the scans after which a strength by any grouping gains as much as this one.
+        """Share of permutations of the scans after which some grouping gains as much as this one.
 
-        An exchange that leaves every scan beside the same others changes nothing, and is not counted.
+        Permutations that leave every group with the same scans are not counted.
         """
         groupings = {name: np.array(own) for name, own in self.study.groups.items() if name != ALL}
         rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[by])
@@ -222,10 +226,10 @@ class Screening:
 
 
 def best_grouping(options: Mapping[str, tuple[float, int]]) -> str | None:
-    """The grouping that gains most; of those that do nearly as well the one with the fewest numbers.
+    """Choose the grouping with the fewest parameters among those that gain nearly the most.
 
     Args:
-        options: by grouping its gain and its numbers. None where none gains.
+        options: gain and number of parameters by grouping. Returns None if none gains.
     """
     most = max((gain for gain, _ in options.values()), default=0.0)
     close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

@@ -1,8 +1,8 @@
-"""The joint search: causes are added while they gain on held-out scans, and each defends its place.
+"""Search for causes: add effects while they gain on held-out scans, and test each again at the end.
 
-All candidates are screened at once, with strengths for all scans and by group. Those that promise about as
-much as the best are fitted in full beside each other before one is taken, because a derivative at the null
-only guesses what a large effect does.
+All candidates are screened at once, with common strengths and strengths by group. The most promising ones are
+fitted in full before one is chosen, because a derivative at zero strength only estimates the gain of a large
+effect.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from litho_models.loop.screening import Screened, Screening, best_grouping
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Labels
 
-# What changes the held-out prediction so alike cannot be told apart by its shape.
+# Correlation of changes from which two effects count as indistinguishable.
 SAME_COSINE = 0.8
 
 
@@ -31,13 +31,13 @@ class Cause:
 
     Attributes:
         name, by: the effect, and the grouping of its strength.
-        alike: other effects that these scans cannot tell from it.
-        judgement: of its gain on held-out scans, the rest of the model in place.
-        family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
-        values: of its parameters by label, from which a table is fitted.
-        reshaped_share: what its change in other shapes would take beside it, of its gain.
-        reason: why its name does not stand, with everything else in place; empty if it does.
-        corrects: the reason is that it may only correct the formula of another.
+        alike: other effects that look the same in these scans.
+        judgement: judgement of its gain on held-out scans, beside the rest of the model.
+        family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
+        values: starting values of its parameters by label, for the fit of a table.
+        reshaped_share: further gain by variants of its change, as a share of its gain.
+        reason: why its name was refused; empty if it was not.
+        corrects: whether it was refused because it may only correct another formula.
     """
 
     name: str
@@ -54,9 +54,9 @@ class Cause:
 
 @dataclass
 class Found:
-    """What a search found: the model, its causes, and what is known of every other candidate.
+    """Result of a search: the model, its causes, and what is known about all other candidates.
 
-    ``failed``: causes whose name did not stand.
+    ``failed``: causes whose name was refused.
     """
 
     state: State
@@ -77,11 +77,11 @@ def search(
     most: int = 8,
     secants: Secants | None = None,
 ) -> Found:
-    """Add effects to a fitted model, at most so many.
+    """Add at most ``most`` effects to a fitted model.
 
     Args:
-        start: the model so far; ``candidates``: what may be added.
-        secants: of the candidates at a model like this one; by default at the model itself.
+        start: the current model; ``candidates``: effects that may be added.
+        secants: secants of the candidates at a similar model; by default at the model itself.
     """
     found = Found(start)
     while len(found.causes) < most and _add_one(found, candidates, secants):
@@ -93,7 +93,7 @@ def search(
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Tables that stand out beside a model, each as a linear fit beside it alone."""
+    """Find significant tables beside a model, each by a separate linear fit."""
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
@@ -103,7 +103,7 @@ def describe(
 
 
 def with_table(state: State, table: Cause) -> State:
-    """A model with such a table beside all the rest, fitted from there."""
+    """Add a table to a model and refit everything."""
     twin = state.twin.with_effect(table.name, table.by, table.values)
     return fit_state(twin, state.study, from_here=True)
 
@@ -139,9 +139,9 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
 
 
 def _regroup(found: Found) -> None:
-    """Let the strength of the cause that was just added differ by group, if that is confirmed.
+    """Let the strength of the last added cause differ by group, if that is confirmed.
 
-    The derivative where the effect stands says more than the one at its null, by which it was screened.
+    The derivative at the fitted strength is more reliable than the one at zero used in screening.
     """
     cause, twin, study = found.causes[-1], found.state.twin, found.state.study
     slots = {
@@ -176,7 +176,9 @@ def _regroup(found: Found) -> None:
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """The three that promise most beside the best, a third of its gain or more, and change much the same."""
+    """Up to three rivals of the best candidate that change much the same and promise at least a third of its
+    gain.
+    """
     near = (one for one in standing if one.gain_nm2 >= 0.3 * best.gain_nm2)
     return [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]
 
@@ -184,7 +186,7 @@ def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) 
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """What these scans cannot tell from it: by fits where there are, by what is screened elsewhere."""
+    """Effects that look the same in these scans, by their fits if available, otherwise by screening."""
     own = fitted[one.name]
     by_fit = [
         name
@@ -218,7 +220,7 @@ def _fit(job: tuple[str, Twin, Study]) -> State:
 
 
 def same_change(before: State, one: State, other: State) -> bool:
-    """Whether two states change the held-out prediction alike."""
+    """Whether two states change the held-out prediction in the same way."""
     inner = np.zeros((2, 2))
     for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
         changes = np.stack([old - a, old - b])
@@ -228,12 +230,12 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Each cause is taken out, the rest fitted again: what is not confirmed with all others in place goes."""
+    """Test each cause again beside all others, and remove it if it is no longer confirmed."""
     if len(found.causes) < 2:
         return
     study = found.state.study
     for cause in list(found.causes):
-        study.report(f"deciding once more on {cause.name}")
+        study.report(f"testing again: {cause.name}")
         without = found.state.without(cause.name)
         judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
         at = found.causes.index(cause)
@@ -246,20 +248,20 @@ def _defend(found: Found) -> None:
 
 
 def untestable(study: Study) -> dict[str, str]:
-    """Effects that these scans cannot test, with the reason."""
+    """Effects that these scans cannot test, with reasons."""
     reasons = {}
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
     for effect in CATALOGUE.values():
         if effect.per_scan:
             continue
         if one_level:
-            reasons[effect.name] = "every layout has one level only: nothing in the print varies with it"
+            reasons[effect.name] = "every layout has only one level, so nothing in the print varies"
         elif "order" in effect.needs and len({scan.context.order for scan in study.scans}) < 3:
             reasons[effect.name] = "the writing order of the scans is not known"
     return reasons
 
 
 def separating(names: Sequence[str]) -> str:
-    """What would tell the members of a set apart."""
+    """The experiments that would tell the members of a set apart."""
     texts = dict.fromkeys(get_effect(name).separating for name in names)
     return "; ".join(text for text in texts if text)

@@ -1,7 +1,7 @@
-"""What single scans add, each its own: datum, gain, bow, drift, registration, offsets of lines.
+"""Find terms that differ from scan to scan: datum, gain, bow, drift, registration, line offsets.
 
-Nobody can foresee it for the next print, so it enters no model. A term is judged as a variance: what it takes
-on one half of a scan's pixels, fitted on the other half, must agree with what is there.
+Such terms cannot be predicted for the next print, so they enter no model. A term is judged by its variance:
+fitted on one half of a scan's pixels, it must agree with the other half.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided
 
 
 class SingleScans:
-    """The scans beside the maps that they should show, with terms fitted on pixels that are not scored.
+    """Scans and their expected maps, with terms fitted on pixels that are not scored.
 
     Args:
-        study: seed, folds; ``scans``: as they are; ``maps_um``: held-out maps (y, x), measurement included.
+        study: seed and folds; ``scans``: original scans; ``maps_um``: held-out maps (y, x) with measurement.
     """
 
     def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
@@ -47,7 +47,7 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Each effect of single scans given those that were seen before it; offsets of lines come last."""
+        """Test each per-scan effect beside those already found; line offsets come last."""
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
         names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
@@ -72,7 +72,7 @@ class SingleScans:
         judgement = _as_variance(before, after, self.study)
         values = self.coefficients(own, accepted | own)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
-        # Where scans of one print are alike, the printer may have done it too.
+        # If scans of one print agree, the printer may also be the cause.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
         terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
@@ -91,7 +91,7 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """(scans, k) of ``own`` terms, fitted beside all ``terms``; displacements in µm."""
+        """(scans, k) of ``own`` terms, fitted together with all ``terms``; displacements in µm."""
         found = []
         lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):
@@ -109,10 +109,11 @@ class SingleScans:
         return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
-        """Offsets of lines, along the scan and along the layout: against columns, then against each other.
+        """Test line offsets along the scan and along the layout, against columns and against each other.
 
-        Scans are turned a little against their layouts. Lines that follow the layout's rows better were
-        written, lines that follow the scan's were measured; where no scan is turned nobody can tell.
+        Scans are slightly rotated against their layouts. Lines that follow the layout's rows come from the
+        printer, lines that follow the scan's rows from the microscope. Without rotation they cannot be told
+        apart.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
@@ -151,9 +152,9 @@ class SingleScans:
         return found
 
     def _with_profile(self, axis: int) -> list[np.ndarray]:
-        """The maps with the mean residual of each line over the scans of the other folds added.
+        """Add to the maps the mean residual of each line over scans of other folds.
 
-        Scans of different sizes have no lines in common: then nothing is added.
+        Nothing is added if scans differ in size, because their lines do not correspond.
         """
         if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
             return list(self.maps_um)
@@ -167,9 +168,9 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """The period that the means of lines have in common, such as that of mains hum, in words.
+        """Describe a common period of the line means, such as that of mains hum, in words.
 
-        It is looked for at all frequencies at once.
+        All frequencies are tested at once.
         """
         (term,) = line_terms(terms_of_effect(name))
         assert term.lines is not None
@@ -188,7 +189,7 @@ class SingleScans:
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:
-        """Residual (y, x) of each scan without datum and bow, 0 where not measured."""
+        """Residual (y, x) of each scan without datum and bow; 0 where not measured."""
         return [
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)
@@ -196,7 +197,9 @@ class SingleScans:
 
 
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
-    """A scan whose own term happens to be near zero gains nothing: the halves have to agree instead."""
+    """Judge a per-scan term by the agreement of the halves, because a scan with a term near zero gains
+    nothing.
+    """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
     products = [np.nanmean(one * (one - left)) for one, left in zip(*residuals_um, strict=True)]
@@ -208,6 +211,6 @@ def _frame(effect: str) -> str:
 
 
 def _columns_of(names: Iterable[str], terms: Terms) -> list[int]:
-    """Columns of ``term_maps(…, terms)`` that belong to some of the terms."""
+    """Columns of ``term_maps(…, terms)`` that belong to the named terms."""
     wanted = parameter_names(names)
     return [at for at, name in enumerate(parameter_names(terms)) if name in wanted]

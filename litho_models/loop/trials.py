@@ -1,4 +1,4 @@
-"""What is tried of a candidate: sets of its parameters, and what they change in the scans."""
+"""The parameter sets to try for each candidate, and the changes that they make in the scans."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from litho_models.loop.prepared import PreparedScan
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect of one shape and size; their amplitudes are fitted together.
+    """Parameter sets of one effect with the same shape and size, whose amplitudes are fitted together.
 
-    ``columns``: where its changes stand among all that are looked at.
+    ``columns``: indices of its changes among those of all trials.
     """
 
     effect: Effect
@@ -29,18 +29,19 @@ class Trial:
 
     @cached_property
     def _facts(self) -> np.ndarray:
-        """Of each amplitude null, lowest and highest value, and distance of an ordinary one from the null."""
+        """Null, lowest and highest value of each amplitude, and its usual distance from the null."""
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """How far multiples (…, sets) take each amplitude (…, amplitudes) from its null."""
+        """Distance of each amplitude (…, amplitudes) from its null at multiples (…, sets)."""
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
-        """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there.
+        """Whether no amplitude is beyond a null that bounds it by more than noise can explain.
 
-        Noise is what is small beside the largest amplitude of any group; multiples (…, sets).
+        Values that are small relative to the largest amplitude of any group count as noise; multiples (…,
+        sets).
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -48,14 +49,14 @@ class Trial:
         return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
-        """Share of the step that stays within the ranges: a straight line from the null overshoots."""
+        """Share of the step that stays within the ranges, because a linear extrapolation may leave them."""
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
         beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
         return float(np.min(room[beyond] / steps[beyond], initial=1.0))
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
-        """Values from which a fit begins, no farther from the null than the largest trial."""
+        """Starting values of a fit, no farther from the null than the largest trial."""
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
         steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
@@ -65,16 +66,16 @@ class Trial:
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """How far each set takes each amplitude from its null, (sets, amplitudes)."""
+    """Distance of each amplitude from its null in each set, (sets, amplitudes)."""
     nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
 
 def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
-    """The trials of the effects by shape and size, their columns from the first one on.
+    """The trials of the effects by shape and size, with columns numbered from ``first``.
 
-    A second trial of the same amplitudes at the same shape is another size: what an effect does when it is
-    large need not be a multiple of what it does when it is small.
+    The same amplitudes at the same shape may be tried at two sizes, because the change by a large effect need
+    not be a multiple of the change by a small one.
     """
     found: list[Trial] = []
     for effect in effects:
@@ -92,10 +93,10 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
 
 class Secants:
-    """What trials change in the windows at a model; what is known of one is not computed again.
+    """Cached changes of the windows by trials, at a given model.
 
     Attributes:
-        free_terms: orthonormal basis (n, k) of what each window may add by itself.
+        free_terms: orthonormal basis (n, k) of the free terms of each window.
     """
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
@@ -108,7 +109,7 @@ class Secants:
         self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
 
     def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
-        """For each window the changes (n,), µm, of each set of each trial."""
+        """The changes (n,), µm, of each window by each set of each trial."""
         rows = []
         for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
             key = effect.name, *values.items()

@@ -36,12 +36,12 @@ MODELS: dict[str, type[Simulator]] = {
 
 
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
-    """Make a model known by its name in every function and command of this process.
+    """Register a model, so that every function and command of this process knows its name.
 
-    Called in a plug-in, it makes the model known in every process of a command.
+    Call it in a plug-in to register the model in every process of a command.
 
     Raises:
-        InputError: a model without a name of its own, or with one that is taken.
+        InputError: a model without its own name, or with a name that is taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
@@ -61,7 +61,7 @@ def model_class(name: str) -> type[Simulator]:
 
 
 def require_models(names: Sequence[str]) -> None:
-    """Check a list of model names, as a user gives one.
+    """Check a user's list of model names.
 
     Raises:
         InputError: no name, one twice, or an unknown one.
@@ -77,10 +77,10 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """The numbers of a model that no fit changes: the usual ones and ``fix``, but not ``free``.
+    """The parameters that no fit changes: the usual ones and ``fix``, without ``free``.
 
     Raises:
-        InputError: an unknown model, or a number to free that is not fixed.
+        InputError: an unknown model, or a parameter to free that is not fixed.
     """
     usual = model_class(name).Config.model_fields["fixed"].default
     for one in free:
@@ -92,7 +92,7 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
     """An untrained model; ``fields`` are config fields (geometry, hyper-parameters).
 
     Raises:
-        InputError: an unknown model or field, or a value that the field does not take.
+        InputError: an unknown model or field, or a value that the field does not allow.
     """
     kind = model_class(name)
     for field in fields:

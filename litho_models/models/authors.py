@@ -1,4 +1,4 @@
-"""The authors' weights in our models: their classes are variant ``authors``, their names are translated.
+"""Load the authors' weights into our models of variant ``authors``, by translating names.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -35,7 +35,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         fields: config fields of the model (geometry).
 
     Raises:
-        InputError: weights of none of their classes, or some that are missing, unknown or of another shape.
+        InputError: weights of an unknown class, or weights that are missing, unknown or of another shape.
     """
     if not isinstance(weights, Mapping):
         hint = "torch.load reads their file"
@@ -65,7 +65,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
             got=f"missing, unknown or of another size: {', '.join(wrong)}",
             wanted="their state_dict as a whole",
         )
-    # Their 1 x 1 convolutions and numbers of shape (1,) are matrices and plain numbers here.
+    # Our models store their 1 x 1 convolutions as matrices, and their tensors of shape (1,) as plain numbers.
     model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})
     return model.eval()
 
@@ -76,7 +76,7 @@ def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Ten
         alpha = float(state["raw_alpha"])
         if not alpha > 0:
             raise InputError("alpha of the authors' physics", got=alpha, wanted="above 0")
-        # Their parameter is the steepness itself, ours the raw number behind it.
+        # Their parameter is the steepness itself; ours is the raw number of a range.
         state["raw_alpha"] = steepness.raw(alpha)
     return state
 

@@ -1,4 +1,4 @@
-"""Baselines, from the layout itself to linear features in closed form: what every model must beat."""
+"""Baselines that every model must beat, from the layout itself to linear features in closed form."""
 
 from typing import ClassVar
 
@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
@@ -77,7 +77,7 @@ class BlurTable(Simulator):
         return kernel_radius_px(float(self.sigma_um.detach()) / self.pitch_um)
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        dose = blur_interior(layout_um, self.sigma_um / self.pitch_um, self.reach_px)
+        dose = gaussian_blur(layout_um, self.sigma_um, self.pitch_um, edge=None, radius_px=self.reach_px)
         return interpolate(dose, self.table_um, 0.0, self.config.full_height_um)
 
 
@@ -117,15 +117,14 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """One blur (a pair: along y, along x), cut to the pixels farther than ``reach_px`` from the edge."""
+    """One blur (or a pair along y, along x), without pixels within ``reach_px`` of the edge."""
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
     rows, columns = (
         slice(reach_px - radius, length - reach_px + radius)
         for radius, length in zip(radii, layout_um.shape[-2:], strict=True)
     )
-    y, x = (torch.tensor(sigma / pitch_um, device=layout_um.device) for sigma in pair)
-    return blur_interior(layout_um[..., rows, columns], (y, x), radii)
+    return gaussian_blur(layout_um[..., rows, columns], pair, pitch_um, edge=None, radius_px=radii)
 
 
 class LinearConfig(SimulatorConfig):
@@ -139,7 +138,7 @@ class LinearConfig(SimulatorConfig):
 class Linear(Simulator):
     """H = w · φ(M): Gaussian blurs, second to fourth power of one blur, its squared slopes, and 1.
 
-    The slopes along y and x have their own weights: the two axes of a print need not behave alike.
+    Slopes along y and x have separate weights, because the two axes of a print may differ.
     """
 
     name = "linear"

@@ -1,7 +1,7 @@
-"""Networks of fixed features of a field: the surroundings of a layout's pixel, or how a height runs along x.
+"""Networks on fixed features of a field: the surroundings of a layout's pixel, or the height along x.
 
-The features have no parameters, so that such a network is fitted to single pixels
-(``litho_models.fitting.pixels``), in seconds; a network trained on crops takes minutes.
+The features have no parameters, so such a network is fitted to single pixels
+(``litho_models.fitting.pixels``). This takes seconds; training on crops takes minutes.
 """
 
 from abc import abstractmethod
@@ -25,7 +25,7 @@ Widths = tuple[float, ...]
 
 
 class FeatureNetworkConfig(BaseModel):
-    """Which features, all lengths in µm, and how many hidden units see them."""
+    """The features, with all lengths in µm, and the number of hidden units."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     LENGTHS: ClassVar[tuple[str, ...]] = ("blurs_um", "slope_blurs_um", "shifts_um", "steep_um")
@@ -79,7 +79,7 @@ class FeatureNetwork(OfField, nn.Module):
         return max(self._radius(*config.blurs_um), slopes, self._steps_px()[-1], steep)
 
     def forward(self, field_um: Tensor) -> Tensor:
-        """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
+        """The network's contribution to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
         features = self.features(field_um)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
             pixels = (feature.flatten() for feature in features)
@@ -93,7 +93,7 @@ class FeatureNetwork(OfField, nn.Module):
         """The same from features (features, n): (n,) µm."""
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # The weights include the standardisation, which saves one pass over the pixels and its gradient.
+        # The weights include the standardisation, which saves a pass over the pixels.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
@@ -108,7 +108,7 @@ class FeatureNetwork(OfField, nn.Module):
         self.scale.copy_(scale)
 
     def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
-        """Means around each pixel, of a field with a margin."""
+        """Local means around each pixel of a field with a margin."""
         return [blurred_interior(field, width, self.pitch_um, margin_px) for width in self.config.steep_um]
 
 
@@ -146,7 +146,7 @@ class Surroundings(FeatureNetwork):
 class ScanAxis(FeatureNetwork):
     """Features of a printed height along x, the microscope's lines: slopes, steps, mean steepness.
 
-    All are 0 where the print does not change along x, and the network adds nothing there.
+    All features are 0 where the print does not change along x, so the network adds nothing there.
     """
 
     has_constant = False

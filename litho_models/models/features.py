@@ -1,22 +1,20 @@
-"""Models linear in many features of the layout: how far blurs, slopes and products go without a network."""
+"""Models that are linear in many features of the layout, such as blurs, slopes and products."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
+from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 # Relative height per µm below which the length of a slope is smoothed, so that it has a derivative at 0.
 _LEAST_SLOPE = 1e-4
-_UNITS_AT_ONCE = 64
 
 
 class FeaturesConfig(SimulatorConfig):
@@ -39,7 +37,7 @@ class FeaturesConfig(SimulatorConfig):
 
 
 class OfField(ABC):
-    """What features of a field have in common: blurs, displacements, and how far they reach."""
+    """Common parts of features: blurs, displacements, and their reach."""
 
     config: Any
     pitch_um: float
@@ -47,10 +45,10 @@ class OfField(ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int:
-        """How far features reach."""
+        """Receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """The smallest field that has features, namely those of one pixel."""
+        """The smallest field, which gives the features of one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -71,10 +69,10 @@ class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
     φ: blurs with their cubes and the products of each pair; slopes along y and x at several blurs, their
-    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps up to
-    them; blurs along one axis; how steep the surroundings are along each axis. Sizes |∂x| and |∂y| are
-    separate features because a microscope's lines make the two axes differ.
-    The weights are found in closed form, see ``litho_models.fitting.ridge``.
+    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps to them;
+    blurs along one axis; steepness of the surroundings along each axis. The sizes |∂x| and |∂y| are separate
+    features, because a microscope's lines make the two axes differ. The weights are found in closed form, see
+    ``litho_models.fitting.ridge``.
     """
 
     name = "features"
@@ -98,7 +96,15 @@ class Features(OfField, Simulator):
 
     def interior(self, layout_um: Tensor) -> Tensor:
         simple, products = self.features(layout_um)
-        return _weighted(self.weights, (*simple, *products))
+        pixels = (feature.flatten() for feature in (*simple, *products))
+        return at_each_pixel(self._height, *pixels, parameters=self.parameters()).view_as(simple[0])
+
+    def _height(self, *features: Tensor) -> Tensor:
+        return self.weights @ self.completed(torch.stack(features))
+
+    def completed(self, features: Tensor) -> Tensor:
+        """All that has a weight, (weights, n), from φ(M) of n pixels."""
+        return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """φ(M) of the interior, (b, 1, y, x) each: blurs, slopes, displaced copies; their products, and 1."""
@@ -116,9 +122,9 @@ class Features(OfField, Simulator):
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """φ(M) (features, n) at the flat indices ``at`` of the interior of one layout (1, 1, y, x)."""
+        """All that has a weight, (weights, n), at flat indices of the interior of one layout (1, 1, y, x)."""
         simple, products = self.features(layout_um)
-        return torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)])
+        return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
 
     def _slopes(self, height: Tensor) -> list[Tensor]:
         """Height, slopes, their sizes and second derivatives, per µm; from a height with a margin of 1 px."""
@@ -173,8 +179,8 @@ class RandomFeaturesConfig(FeaturesConfig):
 class RandomFeatures(Features):
     """``Features`` plus tanh(V z + c), z the standardised simple features, V and c random and fixed.
 
-    A network with one hidden layer that is not trained (random features, Rahimi and Recht 2008): what lies
-    beyond products of two features can be learned, still in closed form.
+    This is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It learns
+    more than products of two features, still in closed form.
     """
 
     name = "random-features"
@@ -197,46 +203,17 @@ class RandomFeatures(Features):
         self.register_buffer("scale", torch.ones(count))
         self.weights = nn.Parameter(torch.cat([self.weights.detach(), torch.zeros(config.units)]))
 
-    def interior(self, layout_um: Tensor) -> Tensor:
-        simple, products = self.features(layout_um)
-        known = len(simple) + len(products)
-        height = _weighted(self.weights[:known], (*simple, *products))
-        standard = self._standard(torch.cat(simple, dim=1))
-        for block in torch.arange(self.config.units).split(_UNITS_AT_ONCE):
-            own = self.weights[known:][block], self.directions[block], self.thresholds[block]
-            # Computed again in the backward pass: all units of a field at once would take gigabytes.
-            height = height + checkpoint(_random_part, standard, *own, use_reentrant=False)
-        return height
-
-    def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """The features of ``Features``, then the random ones."""
-        known = super().at_pixels(layout_um, at)
-        standard = self._standard(known[None, : len(self.centre), :, None])[0, ..., 0]
-        return torch.cat([known, torch.tanh(self.directions @ standard + self.thresholds[:, None])])
+    def completed(self, features: Tensor) -> Tensor:
+        standard = (features[: len(self.centre)] - self.centre[:, None]) / self.scale[:, None]
+        return torch.cat([features, torch.tanh(self.directions @ standard + self.thresholds[:, None])])
 
     def standardise(self, centre: Tensor, scale: Tensor) -> None:
         """Set the mean and standard deviation (simple features,) of the random features' inputs."""
         self.centre.copy_(centre)
         self.scale.copy_(scale)
 
-    def _standard(self, simple: Tensor) -> Tensor:
-        return (simple - self.centre[:, None, None]) / self.scale[:, None, None]
-
-
-def _random_part(standard: Tensor, weights: Tensor, directions: Tensor, thresholds: Tensor) -> Tensor:
-    """Weighted sum (b, 1, y, x) of some units over (b, features, y, x)."""
-    seen = torch.einsum("bfyx,uf->buyx", standard, directions) + thresholds[:, None, None]
-    return torch.einsum("buyx,u->byx", torch.tanh(seen), weights)[:, None]
-
-
-def _weighted(weights: Tensor, features: Sequence[Tensor]) -> Tensor:
-    height = torch.zeros_like(features[0])
-    for weight, feature in zip(weights, features, strict=True):
-        height = height + weight * feature
-    return height
-
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixels ``step`` above, below, left and right of those farther than ``step`` from the edge."""
+    """The pixels ``step`` above, below, left and right of all pixels farther than ``step`` from the edge."""
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

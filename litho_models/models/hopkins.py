@@ -1,9 +1,9 @@
 """Partially coherent imaging by a sum of coherent systems (SOCS).
 
-Hopkins: I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross coefficients
-C(f₁, f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408 (1953)). C is
-A⁺A with A(s, f) = P(s + f), so that the singular vectors of A are its kernels: I = Σ_k |h_k * t|² (Cobb, PhD
-thesis, Berkeley 1998).
+Hopkins: I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross coefficients C(f₁,
+f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408 (1953)). C is A⁺A
+with A(s, f) = P(s + f), so the singular vectors of A are the kernels: I = Σ_k |h_k * t|² (Cobb, PhD thesis,
+Berkeley 1998).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from litho_data.foundation.errors import InputError
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
-# Sample points along each side of a frequency cell, which measure the share of it that the source fills. The
-# number is odd, so that one point is the centre.
+# Sample points along each side of a frequency cell, for the share that the source fills. The number is odd,
+# so one point is the centre.
 _COUNTED = 9
 
 
@@ -50,11 +50,11 @@ def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
-    """Image of a mask (b, 1, y, x), 1 where all is open; cut by the reach of the kernels."""
+    """Image of a mask (b, 1, y, x), relative to an open mask, without a border as wide as the kernels."""
     reach = kernel_reach_px(optics, pitch_um)
     ny, nx = transmission.shape[-2:]
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
-    # Transforms spread rounding over the field; in double precision a tile prints what the whole field does.
+    # Transforms spread rounding over the field. Double precision keeps tiles equal to the whole field.
     image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
     return image.to(transmission.dtype)
 
@@ -62,7 +62,7 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
     """Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the kernels.
 
-    The mask is transformed once, and back with all kernels in one batch.
+    The mask is transformed once; the transforms back run in one batch over all kernels.
     """
     amplitudes = torch.fft.ifft2(torch.fft.fft2(transmission) * spectra)
     return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
@@ -125,7 +125,7 @@ def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) ->
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
     placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
-    # A mask that is open everywhere has the intensity 1, whatever the number of kernels.
+    # An open mask has the intensity 1 for any number of kernels.
     spectra = np.fft.fft2(placed)
     spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
     return torch.from_numpy(spectra)

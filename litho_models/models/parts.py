@@ -1,4 +1,4 @@
-"""The parts of a printer: each a function from one field to the next, with its numbers and its source.
+"""The parts of a printer: functions from one field to the next, with parameters and a source.
 
 Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop them by its reach.
 """
@@ -13,28 +13,28 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError, require_known
-from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
 from litho_models.simulator import crop_border
 
-# Change of the resist from pixel to pixel below which there is no edge.
+# Change of the resist between pixels below which no edge exists.
 FLATTEST = 5e-3
-# The range of a length ends at this multiple of its start.
+# The range of a length ends at this multiple of its starting value.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
-# Tensors; those that are not fitted are plain numbers.
+# Fitted values are tensors, others are plain numbers.
 Values = Mapping[str, Any]
 Apply = Callable[[Tensor, Values, float], Tensor]
 
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a part.
+    """One parameter of a part.
 
     Attributes:
-        start: where a fit begins; ``unit``: ``1`` for none.
+        start: starting value; ``unit``: ``1`` for none.
         lower, upper: its range; by default a length ends at five times its start.
         fitted: whether a fit changes it; otherwise it keeps its value.
     """
@@ -56,8 +56,8 @@ class Part:
     """A stage of a printer.
 
     Attributes:
-        name, stage: what it is called, and where it acts.
-        numbers: by name, see ``Number``; ``source``: where the formula comes from.
+        name, stage: its name, and the stage at which it acts.
+        numbers: parameters by name, see ``Number``; ``source``: source of the formula.
         apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
@@ -71,7 +71,7 @@ class Part:
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
     """Pixels that a Gaussian spot reaches."""
-    # Float32 rounds a width; its last digits must not move the edge of the kernel.
+    # Float32 rounds a width, and its last digits must not change the size of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
 
@@ -80,19 +80,19 @@ def illuminate(
 ) -> Tensor:
     """Illumination: exposure by a spot of several Gaussians, Σ share · G_sigma; cropped by ``reach_px``.
 
-    One Gaussian for light or a fine beam; a second, wide one for backscattered electrons (Chang, J. Vac. Sci.
-    Technol. 12, 1271 (1975)); a third between them.
+    One Gaussian describes light or a fine beam, a second, wide one backscattered electrons (Chang, J. Vac.
+    Sci. Technol. 12, 1271 (1975)), and a third lies between them.
 
     Args:
-        pattern: what is written, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each.
+        pattern: written pattern, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each
+            Gaussian.
         reach_px: at least the widest reach of the spots.
     """
     total = torch.zeros(())
     for share, sigma_um in spots:
         radius = spot_radius_px(sigma_um, pitch_um)
-        total = total + share * blur_interior(
-            crop_border(pattern, reach_px - radius), sigma_um / pitch_um, radius
-        )
+        seen = crop_border(pattern, reach_px - radius)
+        total = total + share * gaussian_blur(seen, sigma_um, pitch_um, edge=None, radius_px=radius)
     return total
 
 
@@ -145,7 +145,8 @@ def _by_spots(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
 
 def _diffuse(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
     sigma_um = values["sigma_um"]
-    return blur_interior(resist, sigma_um / pitch_um, spot_radius_px(sigma_um, pitch_um))
+    radius = spot_radius_px(sigma_um, pitch_um)
+    return gaussian_blur(resist, sigma_um, pitch_um, edge=None, radius_px=radius)
 
 
 def _optics(values: Values) -> Optics:
@@ -212,14 +213,14 @@ PARTS = {
             "resist",
             {},
             lambda resist, values, pitch: 1 - resist,
-            "a positive resist remains where a negative one goes, an imprint is the inverse of its master",
+            "a positive resist remains where a negative one is removed; an imprint inverts its master",
         ),
         Part(
             "diffusion",
             "diffusion",
             {"sigma_um": Number(0.1, "µm")},
             _diffuse,
-            "Gaussian spread of what the dose made",
+            "Gaussian spread of the reaction products",
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(
@@ -242,7 +243,7 @@ PARTS = {
 
 
 def register_part(part: Part) -> Part:
-    """Make a part known by its name, for ``parts`` of the printers of this process.
+    """Register a part, so that ``parts`` of printers in this process can name it.
 
     Raises:
         InputError: a name that is taken.

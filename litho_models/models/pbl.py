@@ -1,8 +1,8 @@
 """PBL: physics-based learning, the paper's simulator with networks for its unknown steps.
 
-arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL
-model": optical blur of fixed width, pointwise network (exposure threshold), diffusion blur of
-learned width, pointwise network (shrinkage), areawise network (what is left).
+arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model": optical
+blur of fixed width, pointwise network (exposure threshold), diffusion blur of learned width, pointwise
+network (shrinkage), areawise network (everything else).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
+from litho_models.layers.gaussian import Edge, Sigma, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
@@ -40,12 +40,12 @@ class PblConfig(SimulatorConfig):
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
-    # Wider than the areawise network sees (0.5 µm): it starts with what no other part can learn.
+    # Wider than the areawise network sees (0.5 µm), so the blur starts where no other part can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
-    # Start as the optically blurred layout and learn what differs; the paper's networks start at random.
+    # Start as the optically blurred layout and learn the difference; the paper's networks start at random.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
     kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
@@ -53,7 +53,7 @@ class PblConfig(SimulatorConfig):
     edge: Edge = "replicate"
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
-    # Not in the paper, nor in frozen models of older versions, whose cards do not know these three.
+    # These three are not in the paper.
     transposable: bool = Field(False, description="areawise network that treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
     scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
@@ -79,7 +79,7 @@ class PblConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As for every model; the lengths of the feature networks are scaled as well."""
+        """As for other models; the lengths of the feature networks are also scaled."""
         config = super().of_variant(variant, **fields)
         parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
         scaled = {
@@ -102,9 +102,10 @@ class Pbl(Simulator):
     With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I),
     g_shrink = 1 + net, g_mismatch(H) = H + net(H), last layers zero at the start.
 
-    To this chain the default adds two networks of fixed features. ``surroundings`` is the influence of the
-    layout within some micrometres, x and y alike. ``scan_axis`` is the influence of the height along x on the
-    measured map: fitted with the rest, so that the rest need not learn it, and left out of ``printer()``.
+    The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
+    the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
+    height along x on the measured map. It is fitted together with the chain, so the chain does not learn this
+    influence, and is left out of ``printer()``.
     """
 
     name = "pbl"
@@ -135,7 +136,7 @@ class Pbl(Simulator):
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """The paper's chain alone, with weights of its own."""
+        """A copy of the paper's chain alone."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
@@ -173,31 +174,25 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """What the chain makes of the interior, and the fields whose features each network sees, µm."""
+        """The chain's height of the interior, and the input fields of each feature network, µm."""
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
-        printed = self._chain_interior(crop_border(layout_um, self.reach_px - self._chain_px - along))
+        printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
         around = self.surroundings
         layouts = [] if around is None else [crop_border(layout_um, self.reach_px - around.reach_px)]
         return crop_border(printed, along), layouts if self.scan_axis is None else [*layouts, printed]
 
-    def _chain_interior(self, layout_um: Tensor) -> Tensor:
-        optical, diffusion = self._radii_px()
-        initial = self._threshold(self._blur(layout_um, self._sigma_optical(layout_um), optical))
-        dose = self._blur(initial, self.sigma_diffusion_um, diffusion)
-        return self._develop(crop_border(initial, diffusion), dose)
-
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        if self.config.edge == "replicate":
-            return super().forward(layout_um)
-        optical, diffusion = self._radii_px()
-        padded = pad_field(layout_um, optical, optical, "zero")
-        initial = self._threshold(self._blur(padded, self._sigma_optical(layout_um), optical))
-        padded = pad_field(initial, diffusion, diffusion, "zero")
-        return self._develop(initial, self._blur(padded, self.sigma_diffusion_um, diffusion), padding=1)
+        return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
-    def _sigma_optical(self, layout_um: Tensor) -> Tensor:
-        return torch.tensor(self.config.sigma_optical_um, device=layout_um.device)
+    def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
+        """What the paper's chain makes of a field with nothing beyond its edge, or of its interior alone."""
+        optical, diffusion = self._radii_px()
+        initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
+        dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
+        if edge is None:
+            return self._develop(crop_border(initial, diffusion), dose)
+        return self._develop(initial, dose, padding=1)
 
     def _radii_px(self) -> tuple[int, int]:
         config, diffusion = self.config, float(self.sigma_diffusion_um.detach())
@@ -207,8 +202,8 @@ class Pbl(Simulator):
         )
         return optical, diffused
 
-    def _blur(self, field: Tensor, sigma_um: Tensor, radius_px: int) -> Tensor:
-        return blur_interior(field, sigma_um / self.pitch_um, radius_px)
+    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
+        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um
@@ -225,8 +220,8 @@ class Pbl(Simulator):
         return height + (product if padding else crop_border(product, self.mismatch.reach_px))
 
     def _shrink_by_table(self, dose: Tensor) -> Tensor:
-        # A blur averages, so the dose cannot leave the range of what was blurred; the range of the
-        # threshold network is that of its own knots and does not depend on the image.
+        # A blur averages, so the dose stays in the range of its input. The threshold network's range is that
+        # of its knots, independent of the image.
         full = self.config.full_height_um
         knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
         reachable = self.thresh.at_knots(0.0, full).detach()
@@ -254,7 +249,7 @@ class AreawiseNet(nn.Module):
         convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
-        self.activation: nn.Module = nn.LeakyReLU(leaky_slope, inplace=True)
+        self.leaky_slope = leaky_slope
         for convolution in convolutions:
             weight = convolution.weight
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -268,8 +263,8 @@ class AreawiseNet(nn.Module):
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
-            features = self.activation(features)
-        # The sum over channels is the height: full precision also where the stack runs in bfloat16.
+            features = functional.leaky_relu(features, self.leaky_slope, inplace=True)
+        # The sum over channels is the height, so it needs full precision even if the stack runs in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding

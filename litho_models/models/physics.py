@@ -1,4 +1,4 @@
-"""Physics: the parameterised simulator of the paper, five or six values with a meaning each.
+"""Physics: the paper's parameterised simulator with five or six physical values.
 
 Optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
 shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model".
@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from litho_models.layers.gaussian import (
     Edge,
+    Sigma,
     Support,
-    blur_interior,
     gaussian_blur,
     pad_field,
     supported_radius_px,
@@ -29,7 +29,7 @@ Spot = Literal["given", "round", "elliptical"]
 
 
 class PhysicsConfig(SimulatorConfig):
-    """The defaults are those of models frozen before there was a gain; variants replace some of them."""
+    """Config of Physics; variants replace some defaults."""
 
     LENGTHS: ClassVar[tuple[str, ...]] = (
         *("sigma_optical_um", "sigma_optical_max_um"),
@@ -40,7 +40,7 @@ class PhysicsConfig(SimulatorConfig):
     spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one per axis")
     sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
-    # The start matters: from a steep threshold in mid-range a fit ends with a straight projection.
+    # The start matters: from a steep threshold in mid-range, fits end at a straight projection.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
     alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
     eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
@@ -48,7 +48,7 @@ class PhysicsConfig(SimulatorConfig):
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
     gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
-    # With 1 the equations are in µm, with None in full heights; the paper has no such height.
+    # With 1 the equations are in µm, with None in units of the full height; the paper has no such height.
     reference_height_um: float | None = Field(
         None, gt=0, description="height that is 1; None: the highest level"
     )
@@ -78,12 +78,11 @@ class PhysicsConfig(SimulatorConfig):
 class Physics(Simulator):
     """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
 
-    In ``default`` H₀ is the nominal full height and g a gain, without which a full level would be pinned to
-    H₀ + b. ``paper`` and ``authors`` have neither: H₀ is 1 µm and g is 1.
-    With a threshold below 0, before the first level, the projection is the concave part of the tanh alone.
-    S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the fixed reference 0 ... 1
-    (``default``), the range of the image (``paper``) or its maximum (``authors``). The last two depend on
-    the crop.
+    In ``default`` H₀ is the nominal full height and g a gain; without it a full level would always print H₀ +
+    b. In ``paper`` and ``authors`` H₀ is 1 µm and g is 1. With a threshold below 0, before the first level,
+    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1:
+    against the fixed reference 0 ... 1 (``default``), the range of the image (``paper``) or its maximum
+    (``authors``). The last two depend on the crop.
     """
 
     name = "physics"
@@ -123,7 +122,7 @@ class Physics(Simulator):
         return keys[self.config.spot]
 
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
-        """Standard deviation of the spot along y and along x, µm; a given one is a plain number."""
+        """Standard deviation of the spot along y and along x, µm; an unfitted one is a plain number."""
         keys = self._spot_keys or ("",)
         given = self.config.sigma_optical_um
         widths = [values.get(key.removeprefix("raw_"), given) for key in keys]
@@ -146,28 +145,26 @@ class Physics(Simulator):
         return self.config.reference_height_um or self.config.full_height_um
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        values = self.values
-        optical, diffusion = self._radii_px(values)
-        along_y, along_x = (
-            torch.as_tensor(sigma / self.pitch_um, device=layout_um.device) for sigma in self._spot_um(values)
-        )
-        aerial = blur_interior(layout_um / self._reference_um, (along_y, along_x), optical)
-        initial = self._project(aerial, values)
-        dose = blur_interior(initial, values["sigma_diffusion_um"] / self.pitch_um, diffusion)
-        return self._develop(crop_border(initial, diffusion), dose, values)
+        return self._printed(layout_um, None)
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        edge, values = self.config.edge, self.values
+        return self._printed(layout_um, self.config.edge)
+
+    def _printed(self, layout_um: Tensor, edge: Edge | None) -> Tensor:
+        """Height of the field with what lies beyond its edge, or of its interior alone."""
+        values = self.values
         optical, diffusion = self._radii_px(values)
-        # A continued layout, blurred, is itself continued from the radius of the optical blur on.
+        # Beyond the radius of the optical blur, a continued layout stays constant when blurred.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
-        spot, sigma_diffusion = self._spot_um(values), values["sigma_diffusion_um"]
-        aerial = gaussian_blur(relative, spot, self.pitch_um, edge=edge, radius_px=optical)
-        initial = self._project(aerial, values)
-        dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
-        return self._develop(crop_border(initial, margin), crop_border(dose, margin), values)
+        initial = self._project(self._blur(relative, self._spot_um(values), optical, edge), values)
+        dose = self._blur(initial, values["sigma_diffusion_um"], diffusion, edge)
+        initial = crop_border(initial, margin if edge else diffusion)
+        return self._develop(initial, crop_border(dose, margin), values)
+
+    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
+        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     # The methods below take the values, computed once per pass: in forward mode every operation is slow.
 

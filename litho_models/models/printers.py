@@ -1,4 +1,4 @@
-"""Printers made of parts: one model, and its settings for several machines."""
+"""Printers made of parts: one model with settings for several machines."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 
 class PrinterConfig(SimulatorConfig):
-    """The parts in order, and the values (fixed or initial) of their numbers, by ``part.number``.
+    """The parts in order, and fixed or initial values of their parameters by ``part.parameter``.
 
-    Each number can also be set as if it were a field: ``spot.sigma_um``.
+    Each parameter can also be set like a field, as ``spot.sigma_um``.
     """
 
     parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names in order of action")
@@ -23,7 +23,7 @@ class PrinterConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As for every model, with numbers of parts among the fields."""
+        """As for other models, with parameters of parts among the fields."""
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
         parts = fields.get("parts", cls.model_fields["parts"].default)
@@ -45,7 +45,7 @@ class PrinterConfig(SimulatorConfig):
         return self
 
     def all_numbers(self) -> list[tuple[Part, str, Number]]:
-        """Every number of every part, with its name."""
+        """All parameters of all parts by name."""
         found = map(part_of, self.parts)
         return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
 
@@ -89,7 +89,7 @@ class Printer(Simulator):
         return self.config.full_height_um * field
 
     def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
-        """The parts, each with its values by their names within it; what is not fitted is a plain number."""
+        """The parts, each with its values by name; unfitted values are plain numbers."""
         known = {**self.config.numbers, **self.values}
         found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}
         for part, name, number in self.config.all_numbers():
@@ -98,7 +98,7 @@ class Printer(Simulator):
 
 
 def _key(name: str) -> str:
-    """Name of a number as a parameter, in which a full stop is not allowed."""
+    """Name of a torch parameter, which must not contain a full stop."""
     return f"raw_{name.replace('.', '__').replace('-', '_')}"
 
 

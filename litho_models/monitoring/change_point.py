@@ -1,14 +1,13 @@
-"""Has the mean of a figure changed since the reference? A test with a stated rate of false alarms.
+"""Test whether the mean of a figure has changed since the reference, at a stated rate of false alarms.
 
-Each new print is tried as the first after a step that lasts to the last print: Student's t with pooled spread
-compares the figures before it, the reference included, with those from it on. Mean and spread are unknown,
-and the t distribution holds for any number of reference prints; unchanged new prints join the reference. This
-is the likelihood ratio for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
-Technology 35, 355). The threshold has a closed form: the comparisons share the rate of false alarms, which
-then holds for the whole set (Bonferroni), however they are correlated. The shares are unequal: a step should
-be noticed within ``SOON`` prints, so comparisons with at least that many prints from the step on get most of
-the rate. With three new prints the rule is nearly the t test of their mean, the best that is possible without
-knowing the spread.
+Each new print is tried as the first after a step that lasts to the last print. Student's t with pooled spread
+compares the figures before the step, including the reference, with those after it. The t distribution holds
+for any number of reference prints, with unknown mean and spread. This is the likelihood ratio for a step in
+the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The comparisons
+share the rate of false alarms, so it holds for the whole set, whatever their correlation (Bonferroni). A step
+should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step get
+most of the rate. With three new prints the rule is nearly the t test of their mean, the best possible test
+for an unknown spread.
 """
 
 from typing import NamedTuple
@@ -84,7 +83,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """The least likely step, and an upper bound for the chance of one as unlikely in unchanged prints.
+    """The most significant step, and an upper bound of its p.
 
     Args:
         series: values of shape (n,) and (m,), n at least 2, m at least 1.
@@ -98,7 +97,7 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
-    """Chance that a rise raises an alarm once ``SOON`` prints show it, or all new ones if these are fewer.
+    """Probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if fewer.
 
     A lower bound, by the noncentral t of the one comparison that starts with the rise.
 
@@ -112,7 +111,7 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
-    """The step that ``chance_to_notice`` gives this chance; infinite beyond ten thousand standard errors."""
+    """The step with this ``chance_to_notice``; infinite beyond ten thousand standard errors."""
     error = _comparison(reference_variance, new_variance, rate)[2]
 
     def beyond(errors: float) -> float:

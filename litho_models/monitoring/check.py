@@ -1,4 +1,4 @@
-"""``litho-models check``: does a printer still behave as its frozen model says, and when to look again."""
+"""``litho-models check``: test whether a printer still behaves as its frozen model says."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +7,8 @@ from litho_data.commands.progress import say
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
-from litho_data.store import Store, open_store
+from litho_data.store import open_store
 from litho_models.frozen.files import load_frozen
-from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.monitoring import wording
 from litho_models.monitoring.inputs import gather
 from litho_models.monitoring.judging import DEFAULT_RATE, judge
@@ -24,12 +23,10 @@ def check(
     *,
     reference: str | Path | None = None,
     new: Sequence[str] = (),
-    residuals: Sequence[str | Path] = (),
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
-    device: str = "cpu",
 ) -> Check:
-    """Compare new prints with those that a model was made of; write ``check.json``, a report and tables.
+    """Compare new prints with a model's reference prints; write ``check.json``, a report and tables.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -37,62 +34,46 @@ def check(
         out: result folder.
         reference: store of unchanged prints; by default those in the model's card.
         new: names of prints of ``store`` that are new; its others are then the reference.
-        residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions of prints
-            that no fit had seen replace the model's.
         false_alarms: chance that an unchanged data set raises an alarm, over all figures.
         tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
-        device: where the model runs.
 
     Raises:
-        InputError: a model, store or benchmark that cannot be read or does not fit, or too few prints.
+        InputError: a model or store that cannot be read or does not fit, or too few prints.
     """
     if not 0 < false_alarms < 0.5:
         raise InputError("rate of false alarms", got=false_alarms, wanted="between 0 and 0.5")
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
     dataset = open_store(store)
-    frozen = load_frozen(model, device=device)
+    frozen = load_frozen(model)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Check.FILE_NAME, subject) as begun:
         say(f"checking {len(dataset)} scans of {dataset.name}")
-        result = _checked(frozen, dataset, reference, new, residuals, false_alarms, tolerance)
+        found = gather(frozen, dataset, reference, new)
+        parameters = frozen.card["parameters"]
+        # The error on the model's training prints is too small for a comparison with new prints.
+        optimistic = wording.too_optimistic(found.reference, parameters)
+        judged = judge(
+            found.reference,
+            found.new,
+            rate=false_alarms,
+            tolerance=tolerance,
+            figures=[figure for figure in FIGURES if figure.name != "error" or not optimistic],
+            between=found.between,
+        )
+        result = Check(
+            run=run_info([], len(found.new), found.dropped),
+            dataset=dataset.dataset_id,
+            model=CheckedModel(name=frozen.name, sha256=frozen.sha256, dataset=frozen.card["dataset"]),
+            reference=found.words,
+            false_alarm_rate=false_alarms,
+            alarm=any(one.alarm is not None for one in judged),
+            verdict=wording.verdict(judged, false_alarms),
+            figures=judged,
+            reference_scans=found.reference,
+            new_scans=found.new,
+            notes=wording.notes(found.reference, found.new, judged, parameters),
+        )
         write_check_report(result, begun.folder)
         result.write(begun.folder)
     return result
-
-
-def _checked(
-    frozen: FrozenSimulator,
-    dataset: Store,
-    reference: str | Path | None,
-    new: Sequence[str],
-    residuals: Sequence[str | Path],
-    false_alarms: float,
-    tolerance: float | None,
-) -> Check:
-    found = gather(frozen, dataset, reference, new, residuals)
-    parameters = frozen.card["parameters"]
-    # The error on prints that the model has seen is too small to compare new prints with.
-    optimistic = wording.too_optimistic(found.reference, parameters)
-    figures = [figure for figure in FIGURES if figure.name != "error" or not optimistic]
-    judged = judge(
-        found.reference,
-        found.new,
-        rate=false_alarms,
-        tolerance=tolerance,
-        figures=figures,
-        between=found.between,
-    )
-    return Check(
-        run=run_info([], len(found.new), found.dropped),
-        dataset=dataset.dataset_id,
-        model=CheckedModel(name=frozen.name, sha256=frozen.sha256, dataset=frozen.card["dataset"]),
-        reference=found.words,
-        false_alarm_rate=false_alarms,
-        alarm=any(one.alarm is not None for one in judged),
-        verdict=wording.verdict(judged, false_alarms),
-        figures=judged,
-        reference_scans=found.reference,
-        new_scans=found.new,
-        notes=wording.notes(found.reference, found.new, judged, parameters),
-    )

@@ -1,7 +1,7 @@
-"""What is checked against what: the scans of a store, and a reference from a store, a print or a card."""
+"""Collect the scans to check, and the reference from a store, other prints or a card."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,10 +10,9 @@ from pydantic import ValidationError
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import first_error
-from litho_data.store import PrintedScan, Store, open_store
+from litho_data.store import Store, open_store
 from litho_models.frozen.on_store import locked_by_the_card, made_of_these_prints, predict_frozen, trained_ids
 from litho_models.frozen.simulator import FrozenSimulator
-from litho_models.noise.residuals import read_residuals
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
@@ -22,9 +21,9 @@ _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
-    """Figures of reference and new scans, what was left out, and the reference in words.
+    """Figures of reference and new scans, excluded scans, and a description of the reference.
 
-    ``between``: the new prints were made among the reference ones.
+    ``between``: whether the new prints were made between reference prints.
     """
 
     reference: list[ScanFigures]
@@ -35,11 +34,7 @@ class Figures(NamedTuple):
 
 
 def gather(
-    frozen: FrozenSimulator,
-    dataset: Store,
-    reference: str | Path | None,
-    new: Sequence[str],
-    residuals: Sequence[str | Path],
+    frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
     """Figures of the new prints and of the reference, of scans of one dose.
 
@@ -49,21 +44,21 @@ def gather(
     """
     if reference is not None and new:
         raise InputError("reference", got="a store and --new", wanted="one of the two")
-    if residuals and reference is None and not new:
-        raise InputError("--residuals", got="no reference prints", wanted="--reference or --new as well")
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     dropped: list[str] = []
-    if new:
-        found = _within(frozen, dataset, new, residuals, dropped)
-    elif reference is not None:
+    if reference is not None:
         other = open_store(reference)
         _check_apart(dataset, other)
         frozen.check_geometry(other.pitch_um, other.level_height_um)
-        old, now = _rows(frozen, other, residuals, dropped), _rows(frozen, dataset, (), dropped)
-        found = Figures(old, now, dropped, f"{other.name}, {reference}")
-    else:
-        found = _of_card(frozen, dataset, dropped)
-    found = _of_one_dose(found)
+        known, words = _rows(frozen, other, dropped), f"{other.name}, {reference}"
+    elif not new:
+        known, words = _of_card(frozen, dataset), f"the prints in the card of {frozen.name}"
+    rows = _rows(frozen, dataset, dropped)
+    if new:
+        _require_prints(new, rows, dataset)
+        known, words = [row for row in rows if row.print not in new], f"the other prints of {dataset.name}"
+        rows = [row for row in rows if row.print in new]
+    found = _of_one_dose(Figures(known, rows, dropped, words, between=bool(new)))
     _check_reference(found.reference, frozen)
     if not found.new:
         raise InputError(
@@ -72,27 +67,16 @@ def gather(
     return found
 
 
-def _within(
-    frozen: FrozenSimulator,
-    dataset: Store,
-    new: Sequence[str],
-    residuals: Sequence[str | Path],
-    dropped: list[str],
-) -> Figures:
-    """Some prints of a store against its others."""
-    rows = _rows(frozen, dataset, residuals, dropped)
+def _require_prints(names: Sequence[str], rows: Sequence[ScanFigures], dataset: Store) -> None:
     known = list(dict.fromkeys(row.print for row in rows))
-    if unknown := [name for name in new if name not in known]:
+    if unknown := [name for name in names if name not in known]:
         raise InputError(
             "--new", got=unknown[0], wanted=f"a print of {dataset.path}: {', '.join(known[:30])}"
         )
-    old = [row for row in rows if row.print not in new]
-    now = [row for row in rows if row.print in new]
-    return Figures(old, now, dropped, f"the other prints of {dataset.name}", between=True)
 
 
-def _of_card(frozen: FrozenSimulator, dataset: Store, dropped: list[str]) -> Figures:
-    """All prints of a store against those in the model's card."""
+def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
+    """Figures of the prints that the model was made of, which are not those of the store."""
     hint = "--reference STORE takes the prints of a store, --new PRINT the other prints of this one"
     if not frozen.card["baseline"]:
         raise InputError(
@@ -103,20 +87,20 @@ def _of_card(frozen: FrozenSimulator, dataset: Store, dropped: list[str]) -> Fig
             f"store {dataset.path}", got="the prints that the model was made of", wanted="new ones", hint=hint
         )
     try:
-        known = [ScanFigures.model_validate(row) for row in frozen.card["baseline"]]
+        return [ScanFigures.model_validate(row) for row in frozen.card["baseline"]]
     except ValidationError as error:
         raise InputError(f"baseline in the card of {frozen.name}", got=first_error(error)) from error
-    words = f"the prints in the card of {frozen.name}"
-    return Figures(known, _rows(frozen, dataset, (), dropped), dropped, words)
 
 
-def _rows(
-    frozen: FrozenSimulator, store: Store, residuals: Sequence[str | Path], dropped: list[str]
-) -> list[ScanFigures]:
+def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[ScanFigures]:
     """Figures of the scans of a store; locked ones of the model's own prints are left out."""
+    seen, locked = trained_ids(frozen, store), set()
+    if made_of_these_prints(frozen, store):
+        locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
+        dropped += [f"{scan_id}: lock box" for scan_id in sorted(locked)]
     rows = []
-    for scan, expected, held_out in _predicted(frozen, store, residuals, dropped):
-        row = scan_figures(scan, expected, held_out=held_out)
+    for scan in (store.scan(scan_id) for scan_id in store.ids if scan_id not in locked):
+        row = scan_figures(scan, predict_frozen(frozen, scan), held_out=scan.id not in seen)
         if row is None:
             dropped.append(f"{scan.id}: a flat layout has no gain")
         else:
@@ -124,24 +108,8 @@ def _rows(
     return rows
 
 
-def _predicted(
-    frozen: FrozenSimulator, store: Store, residuals: Sequence[str | Path], dropped: list[str]
-) -> Iterator[tuple[PrintedScan, np.ndarray, bool]]:
-    """Scans, the map expected of each, and whether the model had not seen the scan."""
-    if residuals:
-        found = read_residuals(store, residuals, frozen.card["model"])
-        yield from ((*pair, found.held_out) for pair in zip(found.scans, found.maps_um, strict=True))
-        return
-    seen, locked = trained_ids(frozen, store), set()
-    if made_of_these_prints(frozen, store):
-        locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
-        dropped += [f"{scan_id}: lock box" for scan_id in sorted(locked)]
-    for scan in (store.scan(scan_id) for scan_id in store.ids if scan_id not in locked):
-        yield scan, predict_frozen(frozen, scan), scan.id not in seen
-
-
 def _of_one_dose(found: Figures) -> Figures:
-    """The scans at the dose that most reference scans have: another dose changes the gain on purpose."""
+    """Scans at the dose of most reference scans; other doses change the gain on purpose."""
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:
         return found

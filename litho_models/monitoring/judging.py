@@ -1,4 +1,4 @@
-"""From figures of scans to a judgement of each figure: pure, without files or models."""
+"""Judge each figure from the figures of scans, without files or models."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,8 +20,9 @@ class Trend(NamedTuple):
 
     Attributes:
         per_print: change from print to print, with its 95 % interval.
-        p: two-sided chance of so steep a line without a trend.
-        prints_left: for how many more prints the 95 % bound of the drift stays within the tolerance.
+        p: two-sided p of the slope.
+        prints_left: number of further prints for which the 95 % bound of the drift stays within the
+            tolerance.
     """
 
     per_print: float
@@ -31,7 +32,7 @@ class Trend(NamedTuple):
 
 
 def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, tolerance: float) -> Trend:
-    """Trend over all prints, and how far it may be trusted.
+    """Trend over all prints, and the number of prints until it reaches the tolerance.
 
     Drift is the change since the middle of the reference, where the model was made: the trend times the
     number of prints since. Its 95 % bound follows from the faster end of the trend's interval. A steady
@@ -49,7 +50,7 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     half = float(student.ppf(0.975, n - 2)) * error
     fastest = max(abs(slope - half), abs(slope + half))
     since_middle = n - 1 - float(place[reference].mean())
-    # Beyond a million prints the number says nothing.
+    # Numbers beyond a million prints are meaningless.
     left = int(np.clip(tolerance / fastest - since_middle, 0, 1e6)) if fastest > 0 else 10**6
     p = 2 * float(student.sf(abs(slope) / error, n - 2)) if error > 0 else float(slope == 0)
     return Trend(float(slope), (slope - half, slope + half), p, left)
@@ -75,8 +76,8 @@ def judge(
         reference, new: scans of prints, in any order; of three reference prints at least.
         rate: chance of a false alarm in an unchanged set, which the figures share by their weights.
         tolerance: largest drift that is allowed, relative; three times the spread by default.
-        between: the new prints were made among the reference ones: the trend is over the common order.
-            Otherwise they follow the reference.
+        between: whether new prints were made between reference prints, so that the trend is over the common
+            order. Otherwise they follow the reference.
     """
     return [
         _judged(figure, reference, new, own, tolerance, between=between)

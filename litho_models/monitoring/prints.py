@@ -1,4 +1,4 @@
-"""``check.json``, and the figures it watches: one value per print of each, and how much prints differ."""
+"""The record ``check.json`` and its figures: one value per print, and their spread between prints."""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
@@ -17,8 +17,8 @@ _LEAST_GAIN = 0.01
 class Figure(NamedTuple):
     """A figure that is watched.
 
-    ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %. ``weight``:
-    its part of the rate of false alarms; the promise about steps is made for the gain.
+    ``of``: logarithm of its value for one scan, so differences are relative: a step of 0.03 is 3 %.
+    ``weight``: its part of the rate of false alarms.
     """
 
     name: str
@@ -32,7 +32,7 @@ FIGURES = (
     Figure(
         "gain",
         "height gain",
-        # A print that failed has no gain to speak of, and may have one below 0.
+        # A failed print may have a gain near or below 0.
         lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
         "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
         "height tells them apart",
@@ -143,11 +143,11 @@ class Alarm(Record):
 class FigureCheck(Record):
     """One figure of the new prints against the reference; all but ``mean`` are relative, 0.01 is 1 %.
 
-    ``mean`` and ``spread``: of the reference prints. ``p``: upper bound for the chance that unchanged prints
-    look as changed; an alarm is raised if it is at most ``alarm_at``, the figure's share of the rate.
-    ``noticeable_step``: the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
-    cases, as is a fall by r/(1 + r); None beyond a factor of e. ``trend``: change per print over all prints.
-    ``measure_again_in``: prints until the 95 % bound of the drift reaches ``tolerance``.
+    ``mean`` and ``spread``: of the reference prints. ``p``: upper bound of the p of a change; an alarm is
+    raised if it is at most ``alarm_at``, the figure's share of the rate. ``noticeable_step``: the rise r that
+    is noticed within three new prints (or all, if fewer) in 9 of 10 cases, as is a fall by r/(1 + r); None
+    beyond a factor of e. ``trend``: change per print over all prints. ``measure_again_in``: prints until the
+    95 % bound of the drift reaches ``tolerance``.
     """
 
     name: str

@@ -18,7 +18,7 @@ _BEARABLE_OPTIMISM = 0.25
 
 
 def verdict(checks: Sequence[FigureCheck], rate: float) -> list[str]:
-    """Sentences, the one that matters first."""
+    """The verdict in sentences, the most important first."""
     return _sentences("verdict", checks=checks, rate=rate, soon=SOON)
 
 
@@ -28,7 +28,7 @@ def notes(
     checks: Sequence[FigureCheck],
     parameters: int = 0,
 ) -> list[str]:
-    """What limits the verdict on prints; ``parameters``: of the model."""
+    """Notes on the limits of the verdict; ``parameters``: number of parameters of the model."""
     return _sentences(
         "notes",
         checks=checks,
@@ -45,7 +45,7 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def optimism(reference: Sequence[ScanFigures], parameters: int) -> float:
-    """By how much a fit makes the error of its own scans too small: parameters over independent pixels.
+    """Relative bias of the error on a fit's own scans: parameters over independent pixels.
 
     Neighbours within a correlation length of the residual count once.
     """

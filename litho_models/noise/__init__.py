@@ -1,4 +1,4 @@
-"""Noise: what no model of the printer can predict, and whether a stated uncertainty is right."""
+"""Noise: the error that no model can predict, and the calibration of stated uncertainties."""
 
 from litho_models.noise.analyse import analyse_noise, analyse_noise_of_files
 from litho_models.noise.result import NoiseAnalysis

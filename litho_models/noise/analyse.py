@@ -1,6 +1,5 @@
-"""``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
+"""``litho-models noise``: estimate the noise of prints from the available measurements."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.begun import growing_folder
@@ -27,7 +26,7 @@ def analyse_noise(
     store: str | Path,
     out: str | Path,
     *,
-    residuals: Sequence[str | Path] = (),
+    residuals: str | Path | None = None,
     model: str | None = None,
     seed: int = 0,
 ) -> NoiseAnalysis:
@@ -36,16 +35,15 @@ def analyse_noise(
     Args:
         store: dataset store, with or without scans of use substrate, flat and steps, with or without doses.
         out: result folder.
-        residuals: folders of ``litho-models benchmark`` (out of fold), or frozen models (folders,
-            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold;
-            several of one kind are taken as an ensemble.
-        model: which model of the benchmarks; their best one by default.
-        seed: decides which pixels are drawn.
+        residuals: folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
+            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold.
+        model: which model of the benchmark; its best one by default.
+        seed: seed of drawn pixels.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.
     """
-    if model is not None and not residuals:
+    if model is not None and residuals is None:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
@@ -53,10 +51,10 @@ def analyse_noise(
         locked = dataset.locked_ids
         scans = [scan for scan in every if scan.id not in locked]
         references = store_references(dataset)
-        spread = read_residuals(dataset, residuals, model) if residuals else None
+        spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # A dose often has one print only, and the matrix judges no model: so it uses locked scans too.
+        # The matrix also uses locked scans, because it judges no model and a dose often has only one print.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
@@ -102,8 +100,8 @@ def analyse_noise_of_files(
 
     Args:
         out: result folder.
-        flat: scan of a flat print; ``substrate``: of the bare substrate; ``steps``: of a staircase.
-        unit, size_um: of the heights and of the field (y, x), where the files state none.
+        flat, substrate, steps: scans of a flat print, the bare substrate and a staircase.
+        unit, size_um: unit of the heights and size (y, x) of the field, if the files state none.
         level_height_um: nominal step of the staircase.
 
     Raises:

@@ -1,31 +1,32 @@
-"""The noise of prints that were not made to measure it, from the out-of-fold residuals of a model.
+"""Estimate the noise of ordinary prints from the out-of-fold residuals of a model.
 
-Two estimates, too high rather than too low: what differs between like surroundings (``estimated_floor``), and
-the roughness where the layout is flat, so that a model has little to get wrong.
+There are two upper estimates: the differences between similar surroundings (``estimated_floor``), and the
+roughness where the layout is flat and model errors are small.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness.texture import FEWEST_LINES
+from litho_data.store import PrintedScan
 from litho_models.noise.residuals import Residuals
 from litho_models.noise.texture import Texture, texture
 from litho_models.noise.variance import layout_slope
 from litho_models.scoring.noise_floor import NoiseFloor, floor_of_residuals, freed_by_policy
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.statistics import pixel_interval, rms
 
 FLAT_SHARE = 0.25
 _FEWEST_PIXELS = 1000
-_FARTHEST_PX = 40
 
 
 class FlatLevel(Record):
     """Residual where the layout is flat, pixels of one level: rms and mean absolute value, nm.
 
-    Each scan is freed of policy ``full+rows``. ``ci95_nm``: interval of σ over prints.
+    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm``: interval of σ over prints.
     """
 
     level: int
@@ -36,74 +37,58 @@ class FlatLevel(Record):
 
 
 class NoiseBudget(Record):
-    """What the prints say about their own noise; both parts are upper estimates.
+    """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
-    ``flat_texture`` is of the same pixels of all scans, freed of policy ``full``: lines are left in.
-    ``flat_length_um`` (y, x): distance over which the correlation of these falls to 1/e; None in older files.
+    ``flat_texture`` is the texture of the same pixels after policy ``full``, so with line offsets.
     """
+
+    # Older results also have the length of correlation.
+    model_config = ConfigDict(extra="ignore")
 
     model: str
     floor: NoiseFloor
     flat_slope: float
     flat_levels: list[FlatLevel]
     flat_texture: Texture | None = None
-    flat_length_um: tuple[float, float] | None = None
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Both estimates from the residuals of one model on scans that it had not seen."""
+    """Make both estimates from the residuals of one model on held-out scans."""
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
-    level, left, number = [], [], []
-    for at, (scan, fit, slope) in enumerate(zip(found.scans, freed["full+rows"], slopes, strict=True)):
-        flat = np.isfinite(fit.residual_um) & (slope <= limit)
-        level.append(scan.mask_level[flat])
-        left.append(NM_PER_UM * fit.residual_um[flat])
-        number.append(np.full(np.count_nonzero(flat), at))
-    levels, residuals, owner = (np.concatenate(part) for part in (level, left, number))
-    squares, sizes = residuals**2, np.abs(residuals)
-    prints = [scan.print_id for scan in found.scans]
-    rows = []
-    for value in np.unique(levels).tolist():
-        mine = levels == value
-        if mine.sum() < _FEWEST_PIXELS:
-            continue
-        interval = pixel_interval(squares[mine], owner[mine], prints)
-        rows.append(
-            FlatLevel(
-                level=value,
-                pixels=int(mine.sum()),
-                sigma_nm=float(np.sqrt(squares[mine].mean())),
-                ci95_nm=None if interval is None else (interval[0] ** 0.5, interval[1] ** 0.5),
-                mae_nm=float(sizes[mine].mean()),
-            )
-        )
-    lines_in = zip(freed["full"], slopes, strict=True)
-    flats = [np.where(slope <= limit, fit.residual_um, np.nan) for fit, slope in lines_in]
-    pitch_um = found.scans[0].pitch_um
-    small = min(min(flat.shape) for flat in flats) < FEWEST_LINES
+    without_lines, with_lines = (
+        [np.where(slope <= limit, fit.residual_um, np.nan) for fit, slope in zip(fits, slopes, strict=True)]
+        for fits in (freed["full+rows"], freed["full"])
+    )
+    small = min(min(flat.shape) for flat in with_lines) < FEWEST_LINES
+    name = f"residuals of {found.model}"
     return NoiseBudget(
         model=found.model,
-        flat_texture=None if small else texture(f"residuals of {found.model}", flats, pitch_um),
-        flat_length_um=(_length_um(flats, pitch_um, 0), _length_um(flats, pitch_um, 1)),
+        flat_texture=None if small else texture(name, with_lines, found.scans[0].pitch_um),
         floor=floor_of_residuals(found.model, found.scans, freed, seed),
         flat_slope=limit,
-        flat_levels=rows,
+        flat_levels=list(_by_level(found.scans, without_lines)),
     )
 
 
-def _length_um(maps_um: Sequence[np.ndarray], pitch_um: float, axis: int) -> float:
-    """Distance along an axis over which the correlation of maps with gaps falls to 1/e, at most 40 px."""
-    maps = [np.moveaxis(one, axis, 0) for one in maps_um]
-    variances = sum(float(np.nanmean(one**2)) for one in maps_um)
-    correlation = [1.0]
-    while correlation[-1] > np.exp(-1) and len(correlation) <= _FARTHEST_PX:
-        lag = len(correlation)
-        products = sum(float(np.nanmean(one[lag:] * one[:-lag])) for one in maps)
-        correlation.append(products / variances)
-    before, after = correlation[-2:]
-    if after > np.exp(-1):
-        return pitch_um * _FARTHEST_PX
-    return float(pitch_um * (len(correlation) - 2 + (before - np.exp(-1)) / (before - after)))
+def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
+    """The flat pixels of each level that has enough of them."""
+    used = [np.isfinite(own) for own in flat_um]
+    level = np.concatenate([scan.mask_level[use] for scan, use in zip(scans, used, strict=True)])
+    residual = NM_PER_UM * np.concatenate([own[use] for own, use in zip(flat_um, used, strict=True)])
+    owner = np.repeat(np.arange(len(scans)), [int(use.sum()) for use in used])
+    prints = [scan.print_id for scan in scans]
+    for value in np.unique(level).tolist():
+        mine = level == value
+        if mine.sum() < _FEWEST_PIXELS:
+            continue
+        interval = pixel_interval(residual[mine] ** 2, owner[mine], prints)
+        yield FlatLevel(
+            level=value,
+            pixels=int(mine.sum()),
+            sigma_nm=rms(residual[mine]),
+            ci95_nm=None if interval is None else (interval[0] ** 0.5, interval[1] ** 0.5),
+            mae_nm=float(np.abs(residual[mine]).mean()),
+        )

@@ -1,17 +1,19 @@
-"""The dose matrix: height, roughness and lost steps against dose, and the dose to print with.
+"""The dose matrix: height, roughness and lost steps against dose, and the recommended dose.
 
-The paper's search for a laser power (appendix "Mask and optical elements fabrication"), made from scans
-that carry a dose: step ladders, or any layout with areas of one level wider than the printer's blur.
+This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
+with a dose, of step ladders or any layout with areas of one level wider than the printer's blur.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.noise.staircase import READABLE_AT, pooled_sd
+from litho_models.noise.staircase import READABLE_AT
+from litho_models.scoring.like_layouts import blurred_layout_um
 
 # Distance from every change of level: four σ of the optical spot, two of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
@@ -19,7 +21,7 @@ _GUARD_UM = 1.0
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Beyond the guard a print still feels its surroundings: diffusion reaches up to 2.5 µm.
+# Surroundings still matter beyond the guard, because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
@@ -46,6 +48,8 @@ class DoseRow(Record):
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
 
+    model_config = ConfigDict(extra="ignore")
+
     dose: float
     scans: list[str]
     levels: list[LevelHeight]
@@ -55,8 +59,6 @@ class DoseRow(Record):
     lost_low: int
     lost_high: int
     worst_readability: float
-    under_exposed: bool
-    over_exposed: bool
 
 
 class DoseMatrix(Record):
@@ -69,11 +71,10 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge the doses of the scans that carry one; notes say what is not judged, and why.
+    """Judge the doses of all scans with a dose; notes state which doses are not judged, and why.
 
-    A dose without three levels that have areas wide enough to measure on is left out; fewer than two doses
-    make no matrix. The recommended dose is, among those that lose the fewest steps at either end, the one
-    whose height comes nearest to the nominal one.
+    A dose needs three levels with areas wide enough to measure, and a matrix needs two doses. Among the doses
+    that lose the fewest steps, the one with the height nearest to nominal is recommended.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
@@ -127,8 +128,6 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
         lost_low=lost_low,
         lost_high=lost_high,
         worst_readability=float((step / spread).min()),
-        under_exposed=lost_low > 0,
-        over_exposed=lost_high > 0 and lost_low < len(lost),
     )
 
 
@@ -143,8 +142,8 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
         y, x = np.nonzero(inside)
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
-        # One height per level, one tilt, and what higher or lower surroundings add: how the height
-        # runs within the treads tells all three apart.
+        # The fit has a height per level, one tilt, and an effect of the surroundings. Height differences
+        # within the treads separate them.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
         others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
@@ -156,7 +155,7 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     for level_number, parts in sorted(found.items()):
         heights = np.concatenate(parts)
         if heights.size >= _FEWEST_PIXELS:
-            rows.append((level_number, float(heights.mean()), pooled_sd(parts), int(heights.size)))
+            rows.append((level_number, float(heights.mean()), _pooled_sd(parts), heights.size))
     ground = rows[0][1] if rows else 0.0
     return [
         LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
@@ -165,16 +164,12 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
 
 
 def _surroundings(scan: PrintedScan) -> np.ndarray:
-    """How much higher the layout is around each pixel than at it, over 1 and 2 µm, (2, ny, nx) µm."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    blurs = [gaussian_filter(layout, reach / scan.pitch_um, mode="nearest") for reach in _REACHES_UM]
-    return np.stack(blurs) - layout
+    """Mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx) µm."""
+    return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 
 
 def _plateaus(scan: PrintedScan) -> np.ndarray:
-    """Measured pixels (ny, nx) off every change of level."""
+    """Measured pixels (ny, nx) away from all changes of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * round(_GUARD_UM / scan.pitch_um) + 1
@@ -185,3 +180,9 @@ def _plateaus(scan: PrintedScan) -> np.ndarray:
 def _run_length(flags: np.ndarray) -> int:
     """Number of leading True values."""
     return int(np.argmin(flags)) if not flags.all() else len(flags)
+
+
+def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
+    """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

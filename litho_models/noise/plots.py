@@ -11,7 +11,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.pictures import LIGHT, new_figure
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
-from litho_models.noise.staircase import READABLE_AT, StepPrint
+from litho_models.noise.staircase import READABLE_AT
 from litho_models.noise.surface import without_background
 
 if TYPE_CHECKING:
@@ -21,64 +21,28 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Each reference scan as a map, freed of its mean, and its middle line; all but steps share a scale."""
-    figure = new_figure(3.1 * len(references) + 0.6, 5.2)
-    grid = figure.subplots(2, len(references), squeeze=False, height_ratios=[1.6, 1])
+    """Each reference scan as a map, freed of its mean; all but steps share a scale."""
+    figure = new_figure(3.1 * len(references) + 0.6, 3.2)
+    grid = figure.subplots(1, len(references), squeeze=False)[0]
     rough = [one for one in references if one.use != "steps"]
     widest = max((np.nanstd(without_background(one.height_um, "offset")) for one in rough), default=0.01)
-    limit_nm = 3 * NM_PER_UM * float(widest)
-    for column, one in enumerate(references):
+    for axes, one in zip(grid, references, strict=True):
         height_nm = NM_PER_UM * without_background(one.height_um, "offset")
         ny, nx = height_nm.shape
         extent = (0, nx * one.pitch_um[1], ny * one.pitch_um[0], 0)
-        bound = None if one.use == "steps" else limit_nm
-        axes = grid[0, column]
-        image = axes.imshow(
-            height_nm, extent=extent, cmap="viridis", vmin=None if bound is None else -bound, vmax=bound
-        )
+        bound = None if one.use == "steps" else 3 * NM_PER_UM * float(widest)
+        low = None if bound is None else -bound
+        image = axes.imshow(height_nm, extent=extent, cmap="viridis", vmin=low, vmax=bound)
         axes.set_title(f"{one.use}: {one.id}", fontsize=9)
+        axes.set_xlabel("x, µm", fontsize=9)
         figure.colorbar(image, ax=axes, shrink=0.75, label="nm")
-        profile = grid[1, column]
-        x_um = (np.arange(nx) + 0.5) * one.pitch_um[1]
-        profile.plot(x_um, height_nm[ny // 2], color="#0b6aa2", lw=0.8)
-        if bound is not None:
-            profile.set_ylim(-bound, bound)
-        profile.set_xlabel("x, µm", fontsize=9)
-        profile.grid(alpha=0.3)
-    grid[1, 0].set_ylabel("middle row, nm")
-    return figure
-
-
-def steps(found: StepPrint) -> Figure:
-    """Step heights with their uncertainty against what can be resolved."""
-    figure = new_figure(6.5, 3.0)
-    axes = figure.subplots()
-    number = np.arange(1, len(found.steps) + 1)
-    heights = np.array([abs(step.height_nm) for step in found.steps])
-    axes.bar(number, heights, 0.6, color="#9aa7b5", yerr=[step.uncertainty_nm for step in found.steps])
-    axes.axhline(
-        found.resolvable_step_nm,
-        color="#c23b22",
-        ls="--",
-        label=f"resolvable by single pixels: {found.resolvable_step_nm:.1f} nm",
-    )
-    if found.resolvable_step_area_nm is not None:
-        axes.axhline(
-            found.resolvable_step_area_nm,
-            color="#2d8a4e",
-            ls=":",
-            label=f"by means over {found.area_um2:g} µm²: {found.resolvable_step_area_nm:.1f} nm",
-        )
-    axes.set_xticks(number)
-    axes.set(xlabel="step", ylabel="height, nm")
-    axes.legend(fontsize=8)
     return figure
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Height, roughness and readability against dose; shaded where steps are lost."""
-    figure = new_figure(10.5, 3.2)
-    left, middle, right = figure.subplots(1, 3)
+    """Heights of the levels, and readability against dose; shaded where steps are lost."""
+    figure = new_figure(8.5, 3.2)
+    left, right = figure.subplots(1, 2)
     doses = np.array([row.dose for row in found.rows])
     for row in found.rows:
         levels = [entry.level for entry in row.levels]
@@ -92,18 +56,14 @@ def dose(found: DoseMatrix) -> Figure:
         )
     left.set(xlabel="level", ylabel="printed height above the lowest level, nm")
     left.legend(fontsize=8, title="dose", title_fontsize=8)
-    middle.plot(doses, [row.roughness_nm for row in found.rows], "o-", color="#c23b22", ms=4)
-    middle.set_ylabel("roughness, nm")
     right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
     right.axhline(READABLE_AT, color="#9aa7b5", ls="--", lw=1)
-    right.set_ylabel("worst step over σ")
-    for axes in (middle, right):
-        axes.set_xlabel("relative dose")
-        axes.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
-        for row in found.rows:
-            if row.under_exposed or row.over_exposed:
-                width = np.ptp(doses) / max(1, len(doses) - 1) / 2
-                axes.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
+    right.set(xlabel="relative dose", ylabel="worst step over σ")
+    right.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
+    width = np.ptp(doses) / max(1, len(doses) - 1) / 2
+    for row in found.rows:
+        if row.lost_low or row.lost_high:
+            right.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
     return figure
 
 

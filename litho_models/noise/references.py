@@ -1,4 +1,4 @@
-"""Scans made to measure the noise: bare substrate, flat print, steps; and what they say."""
+"""Scans for measuring the noise (bare substrate, flat print, steps), and their results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,6 @@ from litho_models.noise.surface import (
     BACKGROUNDS,
     PrintNoise,
     SurfaceNoise,
-    pooled,
     print_noise,
     surface_noise,
     without_background,
@@ -30,7 +29,7 @@ _FEWEST_PIXELS = 64
 
 @dataclass(frozen=True)
 class Reference:
-    """A scan made to measure the noise: ``use`` is substrate, flat or steps; heights and pitch in µm."""
+    """A scan for measuring the noise; ``use`` is substrate, flat or steps; heights and pitch in µm."""
 
     id: str
     use: str
@@ -39,9 +38,9 @@ class Reference:
 
 
 class ReferencePrints(Record):
-    """What the reference scans say: roughness of each surface, of the print alone, and the steps.
+    """Results of the reference scans: roughness of each surface, of the print alone, and the steps.
 
-    ``textures`` are of substrates and flat prints on square pixels, freed of a polynomial of second degree.
+    ``textures``: those of substrates and flat prints with square pixels, without a quadratic background.
     """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
@@ -79,7 +78,7 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
     substrates, flats = surfaces("substrate"), surfaces("flat")
     alone = [
-        print_noise(flat, pooled([s for s in substrates if s.background == flat.background]))
+        print_noise(flat, [one for one in substrates if one.background == flat.background])
         for flat in flats
         if substrates
     ]
@@ -105,10 +104,10 @@ def _has_texture(one: Reference) -> bool:
 
 
 class RepeatedPrints(Record):
-    """Noise of one print, nm: from print and microscope, and at edges from registration.
+    """Noise of one print, nm, by print, microscope and, at edges, registration.
 
-    Each pair is freed of a polynomial of second degree, so datum, tilt and bow are not in it, nor is what
-    repeats from print to print. ``ci95_nm`` resamples pairs.
+    A polynomial of second degree is removed from each pair, so datum, tilt and bow are not included. Errors
+    that repeat from print to print are not included either. ``ci95_nm`` resamples pairs.
     """
 
     sigma_nm: float
@@ -118,10 +117,10 @@ class RepeatedPrints(Record):
 
 
 def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
-    """Half the variance between prints of one layout at one dose; None where nothing was repeated.
+    """Half the variance between prints of one layout at one dose; None without repeated prints.
 
-    The mean absolute value is that of the difference over √2, as for a Gaussian; other noise is within a few
-    percent of it (``estimated_floor``).
+    The mean absolute value is that of the difference divided by √2. This is exact for a Gaussian, and within
+    a few percent for other noise (``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:

@@ -72,7 +72,7 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     if rows:
         page.table(
             rows,
-            "Roughness. MAE is measured about the median; 0.798 σ is what a Gaussian would have.",
+            "Roughness. MAE is measured about the median.",
             "surfaces.csv",
         )
     if found.print_noise:
@@ -102,11 +102,11 @@ def _texture(page: Page, found: Texture) -> None:
 
 def _steps(page: Page, found: StepPrint) -> None:
     page.heading(f"Steps of {found.id}", folded=True)
-    page.figure(plots.steps(found), "Step heights and the smallest step that can be told from none.")
     page.table(
         [{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)],
         f"Steps along {found.axis}; tread σ {found.tread_sigma_nm:.2f} nm. Readability is height over σ; "
-        "misread pixels are nearer to the other tread.",
+        "misread pixels are nearer to the other tread. Single pixels tell steps of "
+        f"{found.resolvable_step_nm:.1f} nm apart.",
         f"steps_{found.id}.csv",
         digits=3,
     )
@@ -142,12 +142,6 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         f"the model lacks. σ(x), the uncertainty at a pixel, is fitted on other {found.left_out} than it is "
         f"judged on; its shape is {_shape(found.variance.freedom)}."
     )
-    if found.epistemic_rms_nm is not None:
-        page.paragraph(
-            f"{found.members} members disagree by {found.epistemic_rms_nm:.2f} nm (RMS over pixels, each "
-            "member freed of its mean). The fitted σ already holds the error that this disagreement is "
-            "part of; the row with it added shows whether it helps."
-        )
     page.figure(
         plots.calibration(found),
         "Scans left out. First: how many pixels lie inside the 90 % interval that was predicted for them. "
@@ -197,11 +191,6 @@ def _budget(page: Page, found: NoiseBudget) -> None:
         "bow, gain and line offsets of each scan are free.",
         "flat_levels.csv",
     )
-    if found.flat_length_um is not None:
-        y_um, x_um = found.flat_length_um
-        page.paragraph(
-            f"Heights there are correlated over {y_um:.2f} µm along y and {x_um:.2f} µm along x (to 1/e)."
-        )
     if found.flat_texture is not None:
         _texture(page, found.flat_texture)
 

@@ -2,7 +2,8 @@
 
 from typing import ClassVar
 
-from pydantic import Field, JsonValue
+import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
@@ -11,12 +12,14 @@ from litho_models.noise.budget import NoiseBudget
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.references import ReferencePrints, RepeatedPrints
-from litho_models.noise.surface import pooled
 from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
+from litho_models.scoring.statistics import rms
 
 
 class NoiseAnalysis(Result):
-    """``noise.json``; ``bounds`` are found in older files, which had them in place of a budget."""
+    """``noise.json``."""
+
+    model_config = ConfigDict(extra="ignore")
 
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = "noise.json"
@@ -28,7 +31,6 @@ class NoiseAnalysis(Result):
     repeats: RepeatedPrints | None = None
     dose: DoseMatrix | None
     budget: NoiseBudget | None = None
-    bounds: list[dict[str, JsonValue]] = Field(default_factory=list)
     spread: SpreadAnalysis | None
     notes: list[str]
 
@@ -47,10 +49,9 @@ def floor_of(
         )
     flats = [flat for flat in found.flats if flat.background == "offset"]
     if flats:
-        flat = pooled(flats)
         return NoiseFloor(
-            mae_nm=flat.mae_nm,
-            rmse_nm=flat.sigma_nm,
+            mae_nm=float(np.mean([one.mae_nm for one in flats])),
+            rmse_nm=rms([one.sigma_nm for one in flats]),
             kind="measured",
             source=f"flat print ({', '.join(one.id for one in flats)}), offset removed, MAE as measured; one "
             "level only: edges and other levels may be rougher",

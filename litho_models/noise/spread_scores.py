@@ -13,8 +13,6 @@ from scipy.stats import t as student
 from litho_data.foundation.kinds import Array
 
 COVERAGE_LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
-# Mean absolute value of a Gaussian of standard deviation 1.
-GAUSSIAN_MAE = float(np.sqrt(2 / np.pi))
 _BINS = 10
 
 

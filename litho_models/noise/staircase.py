@@ -1,9 +1,9 @@
-"""Step prints: where the treads are, how high the steps, and how well neighbours can be told apart."""
+"""Step prints: treads, heights of steps, and readability of neighbouring levels."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -18,9 +18,7 @@ from litho_models.scoring.statistics import rms
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
-# Side of the squares whose means are compared.
-_AREA_UM = 1.0
-# A tread narrower than this share of the field is an edge, not a tread.
+# Narrowest tread, as a share of the field.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
@@ -30,16 +28,16 @@ class Step(Record):
 
     Args:
         readability: height over the σ of single pixels on its two treads.
-        misread: share of the pixels of both treads nearer to the other one, as measured.
-        misread_if_gaussian: the same for Gaussian heights of that σ: Φ(−readability/2).
+        misread: share of the pixels of both treads nearer to the other one.
     """
+
+    model_config = ConfigDict(extra="ignore")
 
     height_nm: float
     uncertainty_nm: float
     sigma_nm: float
     readability: float
     misread: float
-    misread_if_gaussian: float
 
 
 class StepPrint(Record):
@@ -48,9 +46,10 @@ class StepPrint(Record):
     Args:
         tread_sigma_nm: rms deviation within the treads, one plane for all removed.
         tread_mae_nm: mean absolute deviation from the median of each tread.
-        resolvable_step_nm: smallest step of which single pixels are told apart: 3.92 σ.
-        area_um2, area_sigma_nm, resolvable_step_area_nm: the same for means over squares of that area.
+        resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
     """
+
+    model_config = ConfigDict(extra="ignore")
 
     id: str
     axis: Axis
@@ -60,9 +59,6 @@ class StepPrint(Record):
     tread_sigma_nm: float
     tread_mae_nm: float
     resolvable_step_nm: float
-    area_um2: float
-    area_sigma_nm: float | None
-    resolvable_step_area_nm: float | None
 
 
 def step_print(
@@ -83,56 +79,44 @@ def step_print(
         InputError: no step found.
     """
     axis, edges_px = find_edges(height_um, level_height_um)
-    along = height_um if axis == "x" else height_um.T
-    pitch_across, pitch_along = pitch_um if axis == "x" else pitch_um[::-1]
+    along, pitch_along = (height_um, pitch_um[1]) if axis == "x" else (height_um.T, pitch_um[0])
     edges_um = [edge * pitch_along for edge in edges_px]
-    steps = stair_steps(along, pitch_along, edges_um=edges_um)
     treads = _treads(along.shape, edges_px, round(_GUARD_UM / pitch_along))
-    flat = _without_plane(along, treads)
-    means, sigmas, deviations = [], [], []
-    for tread in treads:
-        heights = flat[:, tread][np.isfinite(flat[:, tread])] * NM_PER_UM
-        means.append(float(heights.mean()))
-        sigmas.append(float(heights.std()))
-        deviations.append(np.abs(heights - np.median(heights)))
-    records = []
-    for number, step in enumerate(steps):
-        sigma = rms(sigmas[number : number + 2])
-        # float32 heights of 1 µm carry 6e-5 nm.
-        ratio = abs(step.height_nm) / max(sigma, 1e-4)
-        records.append(
+    flat_nm = NM_PER_UM * _without_plane(along, treads)
+    heights = [flat_nm[:, tread][np.isfinite(flat_nm[:, tread])] for tread in treads]
+    steps = []
+    for step, (first, second) in zip(
+        stair_steps(along, pitch_along, edges_um=edges_um), pairwise(heights), strict=True
+    ):
+        sigma = rms([first.std(), second.std()])
+        steps.append(
             Step(
                 height_nm=step.height_nm,
                 uncertainty_nm=step.uncertainty_nm,
                 sigma_nm=sigma,
-                readability=ratio,
-                misread=_misread(flat, treads[number], treads[number + 1]),
-                misread_if_gaussian=float(GAUSSIAN.probability_below(-ratio / 2)),
+                # float32 heights of 1 µm carry 6e-5 nm.
+                readability=abs(step.height_nm) / max(sigma, 1e-4),
+                misread=_misread(first, second),
             )
         )
-    tread_sigma = rms(sigmas)
-    block = max(1, round(_AREA_UM / pitch_across)), max(1, round(_AREA_UM / pitch_along))
-    area_sigma = _sigma_of_block_means(flat, treads, block)
+    tread_sigma = rms([own.std() for own in heights])
     return StepPrint(
         id=scan_id,
         axis=axis,
         edges_um=edges_um,
-        tread_means_nm=[mean - means[0] for mean in means],
-        steps=records,
+        tread_means_nm=[float(own.mean() - heights[0].mean()) for own in heights],
+        steps=steps,
         tread_sigma_nm=tread_sigma,
-        tread_mae_nm=float(np.concatenate(deviations).mean()),
+        tread_mae_nm=float(np.concatenate([np.abs(own - np.median(own)) for own in heights]).mean()),
         resolvable_step_nm=READABLE_AT * tread_sigma,
-        area_um2=_AREA_UM**2,
-        area_sigma_nm=area_sigma,
-        resolvable_step_area_nm=None if area_sigma is None else READABLE_AT * area_sigma,
     )
 
 
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
     """The axis of a staircase and the pixels at which a new tread starts, ascending.
 
-    The profile of medians is cut into constant pieces with the least squared error. Each edge has a
-    price: it has to save what an edge between two narrowest treads that differ by half a level saves.
+    The profile of medians is fitted by constant pieces with the least squared error plus a price per edge.
+    The price is the saving by an edge between two of the narrowest treads that differ by half a level.
 
     Raises:
         InputError: no edge along either axis.
@@ -181,7 +165,7 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Columns of each tread, off its edges by the guard, but never by more than a third of its width."""
+    """Columns of each tread without a guard at its edges, which is at most a third of its width."""
     limits = [0, *edges_px, shape[1]]
     treads = []
     for start, stop in pairwise(limits):
@@ -191,7 +175,7 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
-    """Heights freed of the one tilt that all treads share; NaN off the treads."""
+    """Heights without the common tilt of all treads; NaN outside the treads."""
     ny, nx = height_um.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     terms = [np.zeros((ny, nx)) for _ in treads]
@@ -205,29 +189,7 @@ def _without_plane(height_um: Array, treads: list[slice]) -> Array:
     return np.where(usable, height_um - weights[0] * y - weights[1] * x, np.nan)
 
 
-def _misread(flat: Array, first: slice, second: slice) -> float:
-    below, above = (flat[:, tread][np.isfinite(flat[:, tread])] for tread in (first, second))
-    if below.mean() > above.mean():
-        below, above = above, below
+def _misread(first: Array, second: Array) -> float:
+    below, above = sorted((first, second), key=np.mean)
     middle = (below.mean() + above.mean()) / 2
     return float((np.mean(below > middle) + np.mean(above < middle)) / 2)
-
-
-def _sigma_of_block_means(flat: Array, treads: list[slice], block: tuple[int, int]) -> float | None:
-    """Pooled sd of the means of blocks (rows, columns) within treads, nm; None with fewer than two."""
-    found = []
-    for tread in treads:
-        region = flat[:, tread]
-        rows, columns = region.shape[0] // block[0], max(1, region.shape[1] // block[1])
-        width = min(block[1], region.shape[1])
-        if rows * columns < 2:
-            continue
-        cut = region[: rows * block[0], : columns * width].reshape(rows, block[0], columns, width)
-        found.append(np.nanmean(cut, axis=(1, 3)) * NM_PER_UM)
-    return pooled_sd(found) if found else None
-
-
-def pooled_sd(parts: Sequence[Array]) -> float:
-    """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
-    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
-    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

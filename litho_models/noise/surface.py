@@ -1,16 +1,15 @@
-"""How rough one surface is: bare substrate, flat print, or the treads of a staircase."""
+"""Roughness of one surface: bare substrate, flat print, or the treads of a staircase."""
 
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import amplitude_parameters, effective_samples
-from litho_models.noise.spread_scores import GAUSSIAN_MAE
-from litho_models.scoring.statistics import rms
 
 Background = Literal["offset", "quadratic"]
 BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
@@ -20,35 +19,33 @@ class SurfaceNoise(Record):
     """Deviation of a surface from its background.
 
     Args:
-        background: what was removed: the mean (``offset``) or a polynomial of second degree.
+        background: the removed background: the mean (``offset``) or a polynomial of second degree.
         sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm`` its standard uncertainty from the
             number of independent heights in the field.
         mae_nm: mean absolute deviation from the median, as measured: no distribution assumed.
-        gaussian_mae_nm: 0.798 σ, what it would be for a Gaussian.
         independent_heights: pixels over the sum of squared autocorrelation.
     """
+
+    model_config = ConfigDict(extra="ignore")
 
     id: str
     background: Background
     sigma_nm: float
     sigma_uncertainty_nm: float
     mae_nm: float
-    gaussian_mae_nm: float
     independent_heights: float
     pixels: int
 
 
 class PrintNoise(Record):
-    """What the print adds to substrate and microscope: ``print² = flat² − substrate²``, nm.
+    """Roughness of the print alone: ``print² = flat² − substrate²``, nm.
 
-    ``print_nm`` is None where the flat print is not rougher than the substrate.
+    ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
 
+    model_config = ConfigDict(extra="ignore")
+
     background: Background
-    flat_nm: float
-    flat_uncertainty_nm: float
-    substrate_nm: float
-    substrate_uncertainty_nm: float
     print_nm: float | None
     print_uncertainty_nm: float | None
 
@@ -69,7 +66,7 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
     if finite.sum() < 64:
         raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
     sigma = amplitude_parameters(deviation).sq_nm
-    # Unmeasured pixels enter the correlation as the mean: they hold no information.
+    # Unmeasured pixels have no information, so they enter the correlation as the mean.
     filled = np.where(finite, deviation, deviation[finite].mean())
     independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
     centred = deviation[finite] - np.median(deviation[finite])
@@ -79,7 +76,6 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
         sigma_nm=sigma,
         sigma_uncertainty_nm=sigma / float(np.sqrt(2 * max(1.0, independent))),
         mae_nm=NM_PER_UM * float(np.abs(centred).mean()),
-        gaussian_mae_nm=GAUSSIAN_MAE * sigma,
         independent_heights=independent,
         pixels=int(finite.sum()),
     )
@@ -97,44 +93,19 @@ def without_background(height_um: np.ndarray, background: Background) -> np.ndar
     return height - np.tensordot(weights, terms, axes=1)
 
 
-def print_noise(flat: SurfaceNoise, substrate: SurfaceNoise) -> PrintNoise:
-    """The print alone, by quadrature: microscope and substrate are taken to add independently.
+def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
+    """The print alone, by quadrature: microscope and substrates are taken to add independently.
 
-    Raises:
-        InputError: surfaces freed of different backgrounds.
+    Args:
+        flat: of the flat print; ``substrates``: one or more, freed of the same background.
     """
-    if flat.background != substrate.background:
-        raise InputError("backgrounds", got=(flat.background, substrate.background), wanted="the same")
-    square = flat.sigma_nm**2 - substrate.sigma_nm**2
-    print_nm = float(np.sqrt(square)) if square > 0 else None
-    uncertainty = None
-    if print_nm is not None:
-        of_flat, of_substrate = (s.sigma_nm * s.sigma_uncertainty_nm for s in (flat, substrate))
-        uncertainty = float(np.hypot(of_flat, of_substrate)) / print_nm
+    square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
+    if square <= 0:
+        return PrintNoise(background=flat.background, print_nm=None, print_uncertainty_nm=None)
+    below = np.linalg.norm([one.sigma_nm * one.sigma_uncertainty_nm for one in substrates]) / len(substrates)
+    print_nm = float(np.sqrt(square))
     return PrintNoise(
         background=flat.background,
-        flat_nm=flat.sigma_nm,
-        flat_uncertainty_nm=flat.sigma_uncertainty_nm,
-        substrate_nm=substrate.sigma_nm,
-        substrate_uncertainty_nm=substrate.sigma_uncertainty_nm,
         print_nm=print_nm,
-        print_uncertainty_nm=uncertainty,
-    )
-
-
-def pooled(surfaces: Sequence[SurfaceNoise]) -> SurfaceNoise:
-    """Several surfaces of one kind as one: variances and mean absolute deviations averaged."""
-    if len(surfaces) == 1:
-        return surfaces[0]
-    sigma = rms([one.sigma_nm for one in surfaces])
-    independent = float(np.sum([one.independent_heights for one in surfaces]))
-    return SurfaceNoise(
-        id="+".join(one.id for one in surfaces),
-        background=surfaces[0].background,
-        sigma_nm=sigma,
-        sigma_uncertainty_nm=sigma / float(np.sqrt(2 * max(1.0, independent))),
-        mae_nm=float(np.mean([one.mae_nm for one in surfaces])),
-        gaussian_mae_nm=float(np.mean([one.gaussian_mae_nm for one in surfaces])),
-        independent_heights=independent,
-        pixels=sum(one.pixels for one in surfaces),
+        print_uncertainty_nm=float(np.hypot(flat.sigma_nm * flat.sigma_uncertainty_nm, below)) / print_nm,
     )

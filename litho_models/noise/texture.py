@@ -1,4 +1,4 @@
-"""What the roughness of flat surfaces looks like: lines or not, in which direction, periodic or not.
+"""Texture of flat surfaces: whether it has lines, in which direction, and with which period.
 
 The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
 """
@@ -6,10 +6,11 @@ The paper calls the roughness of its flat print line-shaped and not periodic (ar
 from collections.abc import Sequence
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.roughness import LinePeriod, line_direction, line_period
+from litho_data.roughness import line_direction, line_period
 
 RARE = 1e-3
 
@@ -23,15 +24,15 @@ class Period(Record):
         p: chance of such a peak anywhere in a smooth spectrum.
         amplitude_nm: root mean square over the surfaces.
         coherence: 1 if the surfaces have one phase, in the frame that they are given in.
-        coherence_p: chance of so much with independent phases (Rayleigh's test); None for one surface.
     """
+
+    model_config = ConfigDict(extra="ignore")
 
     period_um: float
     share: float
     p: float
     amplitude_nm: float
     coherence: float
-    coherence_p: float | None
 
 
 class Lines(Record):
@@ -39,8 +40,8 @@ class Lines(Record):
 
     Args:
         along: ``x`` (rows) or ``y`` (columns).
-        share: part of the surface's variance that is in the means of the lines. A surface without lines has
-            a share too: compare the two axes.
+        share: part of the surface's variance in the means of the lines. A surface without lines also has a
+            share, so compare the two axes.
         period: the strongest one of these means; None below 64 lines.
     """
 
@@ -103,26 +104,19 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
     means = [_line_means(np.asarray(height, np.float64) - np.nanmean(height), axis) for height in heights_um]
     variances = [float(np.nanvar(height)) for height in heights_um]
     shares = [own.var() / all_of_it for own, all_of_it in zip(means, variances, strict=True) if all_of_it > 0]
-    found = line_period(means, pitch_um)
-    return Lines(
-        along=along,
-        share=float(np.mean(shares)) if shares else 0.0,
-        period=None if found is None else _period(found, len(means)),
-    )
-
-
-def _period(found: LinePeriod, surfaces: int) -> Period:
-    return Period(
-        period_um=found.period_um,
-        share=found.share,
-        p=found.p,
-        amplitude_nm=NM_PER_UM * found.amplitude_um,
-        coherence=found.coherence,
-        coherence_p=float(np.exp(-surfaces * found.coherence**2)) if surfaces > 1 else None,
-    )
+    period = None
+    if found := line_period(means, pitch_um):
+        period = Period(
+            period_um=found.period_um,
+            share=found.share,
+            p=found.p,
+            amplitude_nm=NM_PER_UM * found.amplitude_um,
+            coherence=found.coherence,
+        )
+    return Lines(along=along, share=float(np.mean(shares)) if shares else 0.0, period=period)
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Mean of each line; one without a measured pixel counts as the mean of all."""
+    """Mean of each line; lines without a measured pixel get the mean of all."""
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

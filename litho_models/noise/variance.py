@@ -1,8 +1,8 @@
-"""σ(x): how the spread of a residual depends on the layout and the place, as a log-linear scale.
+"""σ(x): a log-linear model of a residual's spread by layout and position.
 
-The mean is fitted first and then kept; ln s² = X β is fitted to its out-of-fold residuals by maximum
-likelihood, with the tails of Student's t. Fitted in two stages, the spread cannot excuse errors of the mean;
-tens of scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
+The mean is fitted first and kept. Then ln s² = X β is fitted to its out-of-fold residuals by maximum
+likelihood, with the tails of Student's t. In two stages the spread cannot excuse errors of the mean. Tens of
+scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
 import numpy as np
@@ -12,6 +12,7 @@ from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
+from litho_models.scoring.like_layouts import blurred_layout_um
 
 # Maps that σ may depend on; the slope is also taken squared, the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
@@ -25,12 +26,12 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# From tails far heavier than any seen in prints to a Gaussian.
+# Shapes from much heavier tails than those of prints to a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
-# The optical spot: what the printer makes of an edge of the layout.
+# The optical spot, which blurs edges of the layout.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
-# Twice the largest covariate effect seen on noise of 1 to 100 nm: keeps exp() finite on the way.
+# Twice the largest effect seen on noise of 1 to 100 nm, to keep exp() finite during the fit.
 _LARGEST_STEP = 2.0
 _STEPS = 60
 
@@ -75,11 +76,7 @@ def covariates_of(places: dict[str, Array]) -> Array:
 
 def layout_slope(scan: PrintedScan) -> Array:
     """Slope of the layout behind the optical spot, height over length, (ny, nx)."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    blurred = gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest")
-    return np.hypot(*np.gradient(blurred, scan.pitch_um))
+    return np.hypot(*np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM), scan.pitch_um))
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:

@@ -1,1 +1,1 @@
-"""What to print and scan next, so that what a closed loop left open is decided."""
+"""Plan the next prints and scans, which answer the open questions of a closed loop."""

@@ -1,4 +1,4 @@
-"""What the plan makes of every open question: difference, power, reason, and what each outcome means."""
+"""What the plan says about each open question: difference, power, reason, meaning of each outcome."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Questi
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
 
-# A wrong name is given with this probability at most.
+# Largest probability of a wrong name.
 Z_DECIDED = float(norm.isf(CONFIRM_P))
-# Of the variance of a term of single scans, that of the print if the printer is its cause.
+# Share of a per-scan term's variance that differs between prints if the printer is the cause.
 PRINT_SHARE = 0.9
 ENOUGH = 0.95
-# Beside this power no allowed experiment separates the rivals.
+# Below this power no allowed experiment counts as separating the rivals.
 HOPELESS = 0.2
 MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Power with so many prints like those of the contrast.
+    """Power with ``prints`` prints like those of the contrast.
 
-    The difference of two squared errors has the mean of the squared distance; its variance is that of the
-    noise along the distance, and that of the distance itself, which varies between prints by the question's
-    ``spread``. What its ``form_nm`` may have made of it does not count, as in the decision.
+    The difference of two squared errors has the squared distance as its mean. Its variance comes from the
+    noise along the distance, and from the distance itself, which varies between prints by the question's
+    ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -42,11 +42,11 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
 
 
 def of_repeats(prints: int, scans: int) -> float:
-    """Power of prints that are taken out and scanned again, to say whose a term of single scans is.
+    """Power of remounted and rescanned prints to attribute a per-scan term to printer or microscope.
 
-    With the F of an analysis of variance: the printer's if scans of one print agree as they never would by
-    chance (p <= 0.005), the microscope's if they agree as little as they never would (p <= 0.005) were it the
-    printer's. The power is the smaller one of both answers.
+    The test is the F of an analysis of variance. The printer is the cause if scans of one print agree more
+    than chance allows (p <= 0.005); the microscope is the cause if they agree less than a printer's effect
+    allows (p <= 0.005). The power is the smaller of the two.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -58,9 +58,9 @@ def of_repeats(prints: int, scans: int) -> float:
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
-    """Power to tell written from scanned lines where the scan is turned: one of the two axes has them."""
+    """Power to tell written from scanned lines in a turned scan, where they lie along different axes."""
     grid = noise.on_grid((size_px, size_px))
-    # The mean over a line has the power at frequency 0 along it.
+    # The mean over a line has the noise power at frequency 0 along the line.
     own_um2 = float(grid[1:, 0].mean()) / size_px * 1e-6
     variance = sd_um**2
     z = variance / ((variance + own_um2) * math.sqrt(2 / (size_px * prints)))
@@ -68,40 +68,41 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 
 def prints_needed(powers: Sequence[float]) -> int | None:
-    """Fewest prints with enough power; None where none of the numbers looked at has it."""
+    """Smallest number of prints with enough power; None if no tested number has it."""
     found = np.flatnonzero(np.array(powers) >= ENOUGH)
     return int(found[0]) + 1 if len(found) else None
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Standard deviations of noise by which a gain exceeds what the form of the model may have made of it.
+    """Significance of a gain, in standard deviations of noise, after allowing for the model's own error.
 
-    With A and B the predictions of two refitted rivals, freed of per-scan terms, D = B - A, and A true but
-    for the noise n and the error e of the form that both share, prints show y = A + e + n and the difference
-    of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages down with
-    prints. The error of the form comes back with every print of a like texture and does not; how it lies to D
-    is not known, and |<D, e>| <= |D| |e| (Cauchy and Schwarz), so that 2 |D| |e| of a difference decide
-    nothing. Rivals with |D| below 2 |e| are told apart by no number of prints. How e really lies to D the new
-    prints show themselves: with A true and no error the gain is |D|²; by what it differs from that, beyond
-    noise, e has spoken. The larger one counts. All four are sums over the same pixels, in one unit.
+    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. If A is true
+    except for noise n and an error e of the form that both share, prints show y = A + e + n, and the
+    difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages
+    out over prints, but e recurs in every print of similar texture. The angle between e and D is unknown. As
+    |<D, e>| <= |D| |e| (Cauchy and Schwarz), up to 2 |D| |e| of a difference is inconclusive, and no number
+    of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without it the gain would
+    be |D|², so a deviation from |D|² beyond noise also counts as an error. The larger of the two allowances
+    is used.
 
     Args:
-        gain: squared error of one rival less that of the other; a negative one counts for the other.
+        gain: squared error of one rival minus that of the other; if negative, it favours the other.
         difference: |D|², squared difference of their predictions.
         sd: standard deviation of the gain by noise.
-        form: |e|², squared error of the form; 0: not known, or none.
+        form: |e|², squared error of the form; 0 if unknown. All four are sums over the same pixels, in one
+            unit.
     """
     if sd <= 0:
         return 0.0
     unknown = 2 * math.sqrt(difference * form)
     seen = abs(abs(gain) - difference) - Z_DECIDED * sd
-    # More than expected is no doubt about which is nearer; less than half of it is.
+    # A gain above the expected one raises no doubt; a gain below half of it does.
     against = max(unknown, seen if abs(gain) < difference else 0.0)
     return float(np.copysign(max(abs(gain) - against, 0.0) / sd, gain))
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
-# What the rivals' numbers could be as well: a difference that rests on one of them may not be there.
+# Draws of the rivals' parameters within their uncertainty, because a difference may depend on one of them.
 DRAWS = 8
 _HOPELESS: Status = "no experiment separates"
 
@@ -113,13 +114,13 @@ def of_rivals(
     random: Sequence[PlannedPrint],
     prints: int,
 ) -> PlannedQuestion:
-    """A question whose rivals are models: judged on the planned prints, and on as many random layouts."""
+    """Plan a question whose rivals are models, with the planned prints and with as many random layouts."""
     question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
     names = [rival.name for rival in question.rivals]
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
-    why = [f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"]
+    why = [f"difference of the nearest two rivals on one random print, in standard deviations: {ways}"]
     if question.spread:
         why.append(f"what a print says varies by {100 * question.spread:.0f} %, beyond noise")
     if question.form_nm is not None:
@@ -136,7 +137,7 @@ def of_rivals(
         "; ".join(why),
         [
             *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
-            "two are as near: these two stay a set, the others are excluded",
+            "two fit equally well: these two stay a set, the others are excluded",
             "all leave more than the noise: none of them is the cause",
         ],
         rivals=names,
@@ -149,7 +150,7 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
+    """Unordered pairs, each in the direction with less power, averaged over the draws."""
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
     for _ in range(DRAWS):
@@ -175,7 +176,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
 def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
-    """A question whose answer lies in how prints are scanned, not in what is printed."""
+    """Plan a question that the way of scanning answers, whatever is printed."""
     if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
         return _planned(

@@ -1,10 +1,10 @@
-"""What new prints decide: the questions of a first round, declared before the new scans are looked at.
+"""Decide with new prints the open questions of a first round, which were declared beforehand.
 
-Every rival is fitted to all prints, old and new, and judged on the new ones alone: the difference of two
-squared errors, less what the form of the model may have made of it, against its standard deviation, from
-blocks of pixels and, as in the plan, from what prints differ by. Scans of one print share its roughness, so
-their blocks are added up before they count. A rival is excluded where another is better with p <= 0.005 and
-by 1 % of its squared error; a name is given where one is left.
+Every rival is fitted to all prints, old and new, and judged on the new ones alone. The difference of two
+squared errors, minus an allowance for the model's own error, is compared with its standard deviation. This
+comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of one print share its
+roughness, so their blocks are added first. A rival is excluded if another is better with p <= 0.005 and by 1
+% of its squared error. A name is given if one rival is left.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def decide(
     new: Sequence[PrintedScan],
     report: Callable[[str], None] = lambda message: None,
 ) -> list[Decision]:
-    """Judge every declared question that scans can answer.
+    """Answer every declared question that scans can answer.
 
     Args:
-        closed: the loop that asked; ``new``: scans that it has not seen.
+        closed: the loop with the questions; ``new``: scans that it has not seen.
     """
     judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
     kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
@@ -63,11 +63,11 @@ def decide(
 
 @dataclass(frozen=True)
 class Judge:
-    """New scans, beside those that a model is known from.
+    """New scans, together with the scans that a model was fitted to.
 
     Attributes:
-        twin: the corrected model, of one strength for all scans; ``study``: what it was fitted to.
-        new: scans that were in no fit so far.
+        twin: the corrected model with common strengths; ``study``: the study that it was fitted to.
+        new: scans that no fit has seen.
     """
 
     twin: Twin
@@ -75,7 +75,7 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Fit every rival, and a model without any, to all scans; judge them on the new ones."""
+        """Fit every rival, and a model without any of them, to all scans, and judge them on the new ones."""
         twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
@@ -88,7 +88,7 @@ class Judge:
         return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
-        """Analysis of variance of a term of single scans: prints against repeats."""
+        """Analysis of variance of a per-scan term, between prints against between repeats."""
         own = terms_of_effect(question.name)
         scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
         by_print: dict[str, list[np.ndarray]] = {}
@@ -108,7 +108,7 @@ class Judge:
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
-        """Variance of line offsets along the layout's rows and along the scan lines of turned scans."""
+        """Compare line offsets of turned scans along the layout's rows and along the scan lines."""
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
             return _decision(question, self.new, BOTH, "no scan is turned", UNSEEN)
@@ -129,7 +129,7 @@ class Judge:
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """The result with what was decided: an effect that is left alone is explained, and has an owner."""
+    """Enter the decisions into the result: a single remaining effect is explained, with its owner."""
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
         rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
@@ -149,9 +149,9 @@ def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Deci
 def compared(
     question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
 ) -> Decision:
-    """Judge the answers to a question by what each leaves of the new scans, maps (y, x) in nm."""
+    """Judge the answers to a question by their residuals on the new scans, maps (y, x) in nm."""
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
-    # As in the loop: a smaller difference may come from what no rival describes.
+    # As in the loop, a smaller difference may come from effects outside all rivals.
     least = {
         name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
         for name, own in left_nm.items()
@@ -180,7 +180,9 @@ def _compare(
     new: Sequence[PreparedScan],
     question: Question,
 ) -> Comparison:
-    """Squared errors of two rivals: sums over blocks of a print, their spread within and between prints."""
+    """Compare the squared errors of two rivals, summed over blocks, with their spread within and between
+    prints.
+    """
     by_print: dict[str, np.ndarray] = {}
     pixels, difference = 0, 0.0
     for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
@@ -189,7 +191,7 @@ def _compare(
         name = scan.stored.print_id
         by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
-    # The mean over blocks is what the print says; their spread about it is noise.
+    # The mean over blocks is the result of a print; the spread about it is noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
     sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
     form = pixels * (question.form_nm or 0.0) ** 2
@@ -208,7 +210,7 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
-    """Who is left, by whom the scans speak for."""
+    """The remaining owners: those that the scans support."""
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
 
@@ -219,7 +221,7 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """What these scans say of a question; decided, unless stated otherwise, where one answer is left."""
+    """The decision on a question; by default it is decided if one answer is left."""
     return Decision(
         question=question.name,
         kind=question.kind,

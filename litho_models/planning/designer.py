@@ -1,4 +1,4 @@
-"""Which scans every print gets, and the tiles of its layout, kept one by one: a killed run goes on."""
+"""Choose the scans of each print and design the tiles of its layout; interrupted runs resume."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ WORDS = {
     Way(pixel_size=0.5): "with pixels of half the size, as much time for each",
 }
 _MOST_EXTRAS = 2
-# A further scan is worth its time if it brings rivals apart by this factor.
+# A further scan is planned if it separates rivals this many times as well.
 _WORTH = 1.3
-# Less dose keeps the exposure of every level among those that the models know; more would not.
+# A lower dose keeps every exposure in the range that the models know; a higher one would not.
 SECOND_DOSE = 0.8
-# Below this many standard deviations a layout shows nothing of the difference.
+# Separation, in standard deviations, below which a layout does not show the difference.
 _NOTHING = 0.3
-# Registration refuses layouts that repeat themselves by more than 0.9; a print shows them less clearly.
+# Registration refuses layouts with repeats above 0.9; the limit is lower because prints are less clear.
 _MOST_REPEATING = 0.7
 
 
 class Chosen(NamedTuple):
-    """How prints are made and scanned, for one question or for all.
+    """Ways to print and scan, for one question or for all.
 
-    ``ways``: scans of each; ``places`` in the write field and ``doses``: of the prints in turn; ``tried``:
-    separation in standard deviations by one scan, and by each way beside it.
+    ``ways``: scans of each print; ``places``, ``doses``: of the prints in turn, places in the write field;
+    ``tried``: separation in standard deviations by one plain scan, and with each other way added.
     """
 
     ways: tuple[Way, ...]
@@ -47,7 +47,7 @@ class Chosen(NamedTuple):
 
 
 def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
-    """What brings the rivals of a question apart.
+    """Choose the ways to print and scan that separate the rivals of a question.
 
     Args:
         level: a layout to try the ways on; ``can_move``: whether the write field is larger than a print.
@@ -57,7 +57,7 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
-        # What each does beside one plain scan; later ones only add to it.
+        # Each way is judged together with one plain scan.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
@@ -73,7 +73,7 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 
 def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
-    """What any of the questions needs; ``asked``: ways that no layout is needed for."""
+    """Combine the choices for all questions; ``asked``: ways for questions that need no layout."""
     ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
     places = max((one.places for one in choices), key=len, default=("centre",))
     return Chosen(tuple(ways), places, max((one.doses for one in choices), key=len, default=(1.0,)), {})
@@ -95,10 +95,10 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Tiles that climbed for the questions in turn, soft levels, and where each began.
+    """Optimise tiles for the questions in turn; returns soft levels, and the start of each tile.
 
     Args:
-        kept: folder of finished tiles; those of an interrupted run are taken as they are.
+        kept: folder of finished tiles; tiles of an interrupted run are reused.
     """
     kept.mkdir(parents=True, exist_ok=True)
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
@@ -121,6 +121,6 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """How well a layout repeats itself, as its registration will judge it: 1 where any shift does as well."""
+    """How closely a layout repeats itself, as registration judges it; 1: another shift fits equally well."""
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

@@ -1,4 +1,4 @@
-"""The plan as a folder: a dataset in waiting, with a sheet for the printer and one for the microscope."""
+"""Write the plan as a folder: a dataset without its scans, and sheets for printer and microscope."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ _REFERENCES = {
     "steps": "height against level; the microscope's gain on a step standard",
     "grating": "scales and unevenness of the scanner, and the tip",
 }
-# What the printer makes of them.
+# Their descriptions for the printer.
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
     "steps": "a stair: height against level",
 }
-# Periods that are sold, µm; of fewer than so many in a field the period is not found.
+# Periods of gratings on the market, µm, and the fewest periods in a field from which the period is found.
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 
 
@@ -57,9 +57,9 @@ _LADDER_PX = 5 * _TREAD_PX
 def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
-    """The rows of the table, and the layout of each."""
+    """Rows of the table, and the layout of each row."""
     size_px = len(planned[0].level)
-    # A stair alone looks the same wherever it is shifted; without room for a frame it is left to chance.
+    # A stair looks the same when shifted, so it gets a frame if there is room.
     ladder = limits.random(size_px, seed + 13)
     if size_px >= _LADDER_PX:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)

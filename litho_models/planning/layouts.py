@@ -1,8 +1,8 @@
-"""Layouts that the rivals print most differently: starts, gradient ascent, and what can be printed at all.
+"""Optimise layouts that the rivals print most differently.
 
-A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and climbs along
-the gradient of the rivals' separation, through their effects. It is low-passed and clipped all the way, so
-that it stays among what the printer has printed and the models know.
+A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and follows the
+gradient of the rivals' separation. It is low-passed and clipped in every step, so it stays similar to the
+layouts that the models know.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Levels rarer than this in the prints so far are not known to the models.
+# Models do not know levels that are rarer than this in earlier prints.
 _RARE = 1e-3
-# Distance of mean and spread of the levels from those of the prints so far that costs nothing.
+# Allowed distance of mean and spread of the levels from those of earlier prints.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be printed: levels, cut-off (cycles/µm), and mean and spread of the levels so far."""
+    """Limits of planned layouts: levels, cut-off (cycles/µm), and mean and spread of the levels in
+    earlier prints.
+    """
 
     lowest: int
     highest: int
@@ -44,7 +46,7 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Levels with a share of a thousandth, and structure no finer than in the prints so far."""
+        """Allow levels with a share of a thousandth, and structure no finer than in earlier prints."""
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
         known = levels[share >= _RARE].tolist()
@@ -53,27 +55,29 @@ class Limits:
         return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
-        """Printable soft levels (y, x) nearest to free ones."""
+        """The printable soft levels (y, x) nearest to free ones."""
         y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
-        """The whole levels to send to the printer, uint8."""
+        """Round to the levels for the printer, uint8."""
         span = self.highest - self.lowest
         return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
 
     def price(self, soft: Tensor) -> Tensor:
-        """The cost of levels whose mean or spread is far from that of the prints so far."""
+        """Penalty for levels whose mean or spread is far from that of earlier prints."""
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
-        """Random structure, (size, size) whole levels; ``finest``: share of the cut-off."""
+        """A random layout, (size, size) whole levels; ``finest``: its cut-off as a share of the largest
+        one.
+        """
         level = random_layout(
             (size_px, size_px),
             levels=self.highest + 1,
-            # A small print holds one period of something at least.
+            # Even a small print contains at least one period.
             cutoff_per_um=max(finest * self.cutoff_per_um, 1.001 / (size_px * self.pitch_um)),
             pitch_um=self.pitch_um,
             seed=seed,
@@ -84,8 +88,8 @@ class Limits:
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
     """Named layouts to start from, (size, size) levels.
 
-    Patterns lie in a frame of random structure, a fifth of the side wide: a scan of what repeats itself
-    cannot be registered.
+    Patterns get a random frame, a fifth of the side wide, because scans of periodic patterns cannot be
+    registered.
     """
     for number, finest in enumerate((1.0, 0.5, 0.8)):
         yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
@@ -111,7 +115,7 @@ def score(
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
 ) -> float:
-    """Separation of the nearest pair by a print of this layout at each of the doses, standard deviations."""
+    """Separation of the nearest pair by a print of this layout at each dose, in standard deviations."""
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
 
@@ -125,7 +129,7 @@ def climb(
     place: Place = "centre",
     steps: int = STEPS,
 ) -> np.ndarray:
-    """Soft levels (y, x) at the top of the way up from ``start``."""
+    """Soft levels (y, x) after gradient ascent from ``start``."""
     free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
@@ -135,10 +139,10 @@ def climb(
         if fresh:
             refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
         apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
-        # Only where the partners are those of this very layout is the height true.
+        # The separation is exact only if the rivals are refitted to this layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
-        # The nearest pair, softly: with the hard minimum two pairs would take turns.
+        # A soft minimum over pairs; with the hard one the ascent would alternate between two pairs.
         climber.zero_grad()
         (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()
@@ -146,7 +150,7 @@ def climb(
 
 
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
-    """Whole levels (size, size) of one print: the tiles side by side, in another order for each print."""
+    """Assemble the tiles into whole levels (size, size), in a different order for each print."""
     side = -(-size_px // tiles[0].shape[0])
     order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
     whole = np.block([order[row * side : (row + 1) * side] for row in range(side)])[:size_px, :size_px]

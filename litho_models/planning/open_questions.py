@@ -1,8 +1,7 @@
-"""What a closed loop leaves open, with everything that an experiment needs to be planned from it.
+"""List the open questions of a closed loop, with everything that the plan of an experiment needs.
 
-A set that the prints cannot tell apart is kept as rivals: the corrected model with each member in turn,
-fitted again to all scans. What may be the printer's or the microscope's is kept as two: it goes with the
-print, or with the scan.
+Effects that look the same become rivals: the corrected model with each of them in turn, refitted to all
+scans. An effect of unknown owner becomes two rivals: one turns with the print, the other with the scan.
 """
 
 from __future__ import annotations
@@ -40,9 +39,9 @@ from litho_models.planning.questions import (
 from litho_models.scan_terms import line_terms, terms_of_effect
 from litho_models.scan_terms.grouped import ALL
 
-# Members of a set, or suspects: every pair of rivals is compared on every layout.
+# Largest number of rivals, because every pair is compared on every layout.
 _MOST_MEMBERS = 3
-# Smallest layout whose spectrum is measured, and the share of its power below the cut-off.
+# Smallest layout whose spectrum is measured, and the share of power below the cut-off.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
@@ -52,7 +51,7 @@ def open_questions(
     result: CloseLoop,
     report: Callable[[str], None] = lambda message: None,
 ) -> OpenQuestions:
-    """Everything that is open, the most valuable first, rivals fitted."""
+    """All open questions with fitted rivals, the most valuable first."""
     asking = _Asking(closed, report)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = [scan.stored for scan in closed.study.scans]
@@ -80,7 +79,7 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 
 
 class _Asking:
-    """Questions with rivals, about one closed loop."""
+    """Makes the questions with rivals about one closed loop."""
 
     def __init__(self, closed: Closed, report: Callable[[str], None]):
         self.closed, self.study, self.report = closed, closed.study, report
@@ -90,12 +89,12 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """The set of a cause or a law, or whose it is; None if nothing is open."""
+        """The question which effect of a set, or which owner, is right; None if nothing is open."""
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
-        # In the place of another a member starts as before any of them was found.
+        # A rival that replaces another starts from the model before any of them was found.
         first = {**self.closed.lawful.first, **self.closed.named.first}
         twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
         return _question(
@@ -107,7 +106,7 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """What stood out and was not confirmed: which of these carries what is left, if any does."""
+        """The question which of the significant but unconfirmed effects, if any, explains the residual."""
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
@@ -121,7 +120,7 @@ class _Asking:
             return None
         twins = [_with(self.twin, one) for one in standing]
         rivals = self._rivals(names, twins)
-        # The loop knows the error of its form with none of them in, which is theirs as well.
+        # The loop has estimated the error of the form without them, which applies to them too.
         learner = Learner(self.study, self.maps)
         fitted = [rival.twin(self.twin.alone()) for rival in rivals]
         rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
@@ -155,11 +154,11 @@ class _Asking:
         return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
 
     def _spread(self, name: str) -> float:
-        """How much the evidence for an effect varies over scans, relative to its mean, beyond noise.
+        """Variation of the evidence for an effect over scans, relative to its mean, beyond noise.
 
-        Each scan says by which multiple a it wants the change d; the difference of its squared errors is
-        |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a. What groups differ by is
-        in d: one more of them does not make its prints contradict each other.
+        Let a be the multiple of the change d that fits a scan best. The difference of the scan's squared
+        errors is |d|² (2 a - 1) plus noise, so it varies by twice the spread of a. Differences between groups
+        are part of d and do not count.
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
@@ -169,7 +168,7 @@ class _Asking:
             if size:
                 multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
                 own.append(self.noise.along(change) ** 2 / size)
-        # Robust: a scan may have a defect.
+        # A robust spread, because a scan may have a defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
@@ -179,16 +178,16 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Whose an effect may be: that of the catalogue, or either's where one orientation cannot say.
+    """Possible owners of an effect: that of the catalogue, or both if scans of one orientation cannot tell.
 
-    A tip that is sharper along one axis looks as a print whose flanks stand proud along one.
+    A tip that is sharper along one axis looks like a print with wider flanks along that axis.
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
 
 
 def _of_single_scans(result: CloseLoop) -> list[Question]:
-    """Terms of single scans whose owner is not known, and offsets of lines."""
+    """Questions about per-scan terms of unknown owner, and about line offsets."""
     return [
         _question(
             "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
@@ -201,7 +200,7 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
-    """A question about effects, in words."""
+    """A question about effects, with its text."""
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":
         text = "offsets of lines: written or scanned"
@@ -216,10 +215,10 @@ def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) ->
 
 
 def _missing_facts(closed: Closed) -> dict[str, str]:
-    """Effects that could not be tested for want of a fact about the prints, with the reason."""
+    """Effects that could not be tested because a fact about the prints is missing, with reasons."""
     reasons = {name: why for name, why in closed.untestable.items() if name in CATALOGUE}
     if "field_um" not in (closed.study.scans[0].stored.write or {}):
         reasons = (
-            dict.fromkeys(_OF_PLACE, "the place of the prints in the write field is not known") | reasons
+            dict.fromkeys(_OF_PLACE, "the position of the prints in the write field is not known") | reasons
         )
     return reasons

@@ -1,8 +1,8 @@
-"""``open_questions.json``: what a closed loop leaves open, as an experiment can be planned from it.
+"""``open_questions.json``: the open questions of a closed loop, from which experiments are planned.
 
-Rivals are fitted to the same prints so that none loses for where its fit began: the base's numbers have more
-than one optimum. A fit with an almost straight projection ends elsewhere than one with a steep one. Two
-effects that do the same, one fitted from each, then differ by several nm² on new layouts.
+Rivals are fitted from the same starting points, because the base has more than one optimum: an almost
+straight projection and a steep one are different optima. Two equivalent effects fitted from different starts
+would differ by several nm² on new layouts.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _TILE_PX = 64
 class NoiseSpectrum(Record):
     """Mean power of tiles of residuals, nm² per pixel of noise variance.
 
-    ``power_nm2``: (n, n) at the frequencies of ``np.fft.fft2`` of a tile; their mean is
-    the variance of a pixel.
+    ``power_nm2``: (n, n) at the frequencies of ``np.fft.fft2`` of a tile; its mean is the variance of a
+    pixel.
     """
 
     power_nm2: list[list[float]]
@@ -47,17 +47,16 @@ class NoiseSpectrum(Record):
         return map_coordinates(power, at, order=1, mode="grid-wrap")
 
     def along(self, change: np.ndarray) -> float:
-        """Standard deviation of the noise along a change (y, x) of the height, nm.
+        """Standard deviation of the noise projected onto a change (y, x) of the height, nm.
 
-        That of the sum over pixels of noise times change, divided by the root of the sum of squares of the
-        change.
+        The projection is the sum over pixels of noise times change, divided by the norm of the change.
         """
         spectrum = np.abs(np.fft.fft2(change)) ** 2
         return float(np.sqrt((spectrum * self.on_grid(change.shape)).sum() / spectrum.sum()))
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Measured minus predicted (y, x), nm, away from the edge and free of what a scan may add by itself.
+    """Measured minus predicted height (y, x), nm, away from the edge and without the scan's free terms.
 
     NaN where not measured.
     """
@@ -69,7 +68,7 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 
 
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
-    """Spectrum of maps of ``left_nm``, from tiles that are measured everywhere."""
+    """Noise spectrum of maps of ``left_nm``, from fully measured tiles."""
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
     window /= np.sqrt((window**2).mean())
@@ -91,12 +90,12 @@ Owner = Literal["printer", "microscope"]
 
 
 class Rival(Record):
-    """One answer to a question: the base with these effects, one strength each, as the prints so far have it.
+    """One answer to a question: the base with these effects at common strengths, fitted to earlier prints.
 
     Attributes:
-        effect: what is at work; ``owner``: whose it is, where that is open.
-        vector: all fitted numbers, those of the base first; ``information``: (p, p), normal matrix of the fit
-            over all pixels that it stands for, µm²; ``covariance``: (p, p), robust over prints or scans.
+        effect: the assumed effect; ``owner``: its owner, if that is the question.
+        vector: all fitted parameters, those of the base first; ``information``: (p, p), normal matrix of the
+            fit over all pixels, µm²; ``covariance``: (p, p), robust over prints or scans.
     """
 
     effect: str
@@ -112,7 +111,7 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """The model, in which an effect goes with the print or with the scan; ``bare``: its base alone."""
+        """The model, whose effect turns with the print or with the scan; ``bare``: its base alone."""
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
         frames: dict[Owner, Frame] = {"microscope": "scan", "printer": "print"}
@@ -121,14 +120,13 @@ class Rival(Record):
 
 
 class Question(Record):
-    """Something a loop left open.
+    """An open question of a loop.
 
     Attributes:
-        spread: how much the evidence that a print gives for the effect varies between the prints so far,
-            relative to its mean, beyond the noise.
-        form_nm: the error of the model's own form at most, rms, by what could still be learned beside the
-            best answer; None where it is not known.
-        sizes: figures of terms of single scans, by name and unit.
+        spread: variation between prints of the evidence for the effect, relative to its mean, beyond noise.
+        form_nm: upper bound of the rms error of the model's form, from what could still be learned beside the
+            best answer; None if unknown.
+        sizes: sizes of per-scan terms, by name and unit.
     """
 
     name: str
@@ -142,9 +140,10 @@ class Question(Record):
 
 
 class OpenQuestions(Result):
-    """``open_questions.json``: what is open, and the noise against which it is to be decided.
+    """``open_questions.json``: the open questions, and the noise for their decision.
 
-    ``level_share``: of the layouts so far; ``cutoff_per_um``: the finest structure in them, cycles/µm.
+    ``level_share``: share of each level in earlier layouts; ``cutoff_per_um``: their finest structure,
+    cycles/µm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
@@ -159,7 +158,7 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Each twin fitted from where it stands, and from the base's numbers of the best one."""
+    """Fit each twin from its current values and from the base values of the best twin."""
 
     def fitted(twin: Twin) -> LeastSquaresFit:
         return fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)

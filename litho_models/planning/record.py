@@ -15,7 +15,9 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One scan of the plan; ``field_x_um``, ``field_y_um``: in the write field; ``dose``: of its print."""
+    """One planned scan; ``field_x_um``, ``field_y_um``: position in the write field; ``dose``: dose of
+    its print.
+    """
 
     id: str
     print: str
@@ -32,7 +34,9 @@ class PlannedScan(Record):
 
 
 class PlannedPair(Record):
-    """Two rivals: the difference that the refitted ones have on the planned prints, and its noise, nm rms."""
+    """Two rivals, the difference of their refitted predictions on the planned prints, and its noise, nm
+    rms.
+    """
 
     rivals: tuple[str, str]
     difference_nm: float
@@ -41,11 +45,12 @@ class PlannedPair(Record):
 
 
 class PlannedQuestion(Record):
-    """An open question and what the plan makes of it.
+    """An open question with its place in the plan.
 
-    ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: with random layouts
-    and the same scans, as ``random_difference_nm``, the smallest of any pair. ``prints_needed``: for a
-    power of 0.95. ``form_nm``: the error of the model's own form at most, None where it is not known.
+    ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: the same with random
+    layouts and the same scans; ``random_difference_nm``: smallest difference of any pair there.
+    ``prints_needed``: number of prints for a power of 0.95. ``form_nm``: upper bound of the error of the
+    model's own form, None if unknown.
     """
 
     name: str
@@ -66,7 +71,7 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan: what to print and scan, and what it will decide; ``settings``: what was asked for."""
+    """A plan: prints, scans and the questions that they decide; ``settings``: settings of the user."""
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"

@@ -1,4 +1,4 @@
-"""The plan for people: what is open, what is printed for it, how the rivals differ there, and the power."""
+"""Draw the report of a plan: open questions, planned prints, predicted differences and power."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write_report(
     page.verdict(_verdict(plan))
     first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
-        layouts_figure(first, plan.levels), "Levels of the first prints; tiles come in another order in each."
+        layouts_figure(first, plan.levels), "Levels of the first prints; each has the tiles in another order."
     )
     rows = [
         {
@@ -58,7 +58,7 @@ def write_report(
         }
         for q in plan.questions
     ]
-    page.table(rows, "Open questions, and what the plan makes of them.", "questions.csv", columns=_COLUMNS)
+    page.table(rows, "Open questions, and what the plan says about them.", "questions.csv", columns=_COLUMNS)
     pictured = {rivalry.question.name: rivalry for rivalry in rivalries}
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
@@ -67,8 +67,8 @@ def write_report(
         if question.name in pictured:
             page.figure(
                 prints_figure(pictured[question.name], planned[0]),
-                "What each rival predicts of the first print as the last of its scans shows it, and what it "
-                "has more than the first rival, nm.",
+                "Prediction of each rival for the last scan of the first print, and its difference from the "
+                "first rival, nm.",
             )
     page.heading("Scans", folded=True)
     page.table(plan.scans, "In the order of scanning.", "order.csv")
@@ -80,26 +80,28 @@ def _verdict(plan: NextPrint) -> str:
     asked = [q for q in plan.questions if q.kind != "fact"]
     decided = "; ".join(q.text for q in asked if q.status == "decides")
     if not asked:
-        return f"No print decides what is open: a fact on the card answers {facts}."
-    wanting = f" A fact on the card, and no print, answers {facts}." if facts else ""
+        return f"No print is needed: a fact in the card answers {facts}."
+    wanting = f" A fact in the card, not a print, answers {facts}." if facts else ""
     return (
-        f"These prints decide, with a chance of {ENOUGH} or more of being right: {decided or 'nothing'}. "
+        f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
         f"{len(asked)} questions are asked.{wanting}"
     )
 
 
 def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
-    """What each rival predicts of a print as the last of its scans shows it, and how it differs."""
+    """Draw each rival's prediction for the last scan of a print, and the differences between rivals."""
     maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
     figure = new_figure(11, 5.5)
     changes = [NM_PER_UM * (own - maps[0] - (own - maps[0]).mean()) for own in maps]
     reach = np.percentile(np.abs(changes[1:]), 99)
+    lowest, highest = np.min(maps), np.max(maps)
     axes = figure.subplots(2, len(maps), squeeze=False)
     for column, (rival, own, change) in enumerate(zip(rivalry.question.rivals, maps, changes, strict=True)):
-        axes[0, column].imshow(own, cmap="viridis")
+        height = axes[0, column].imshow(own, cmap="viridis", vmin=lowest, vmax=highest)
         axes[0, column].set_title(rival.name, fontsize=9)
         picture = axes[1, column].imshow(change, cmap="RdBu_r", vmin=-reach, vmax=reach)
     for one in axes.flat:
         one.set_axis_off()
-    figure.colorbar(picture, ax=axes[1], label="nm", shrink=0.7)
+    figure.colorbar(height, ax=axes[0], label="height, µm", shrink=0.7)
+    figure.colorbar(picture, ax=axes[1], label="difference, nm", shrink=0.7)
     return figure

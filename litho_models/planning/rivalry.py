@@ -1,10 +1,10 @@
-"""How far rivals differ on planned scans, each refitted to the other, against the noise.
+"""Separation of rivals on planned scans: the difference after a refit, relative to the noise.
 
-T-optimal discrimination (Atkinson and Fedorov 1975): of two models the distance between what one predicts and
-the nearest that the other can predict. Both directions count, and the smaller one is kept, as neither is
-known to be true (a simple form of the symmetric criterion of Harman and Müller, arXiv:1709.10320). Every scan
-may add its own datum, tilt, bow, gain and affine registration. The refitted model keeps to what the prints so
-far say about it, and to the ranges of its parameters.
+The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
+the nearest prediction of the other. As neither model is known to be true, the smaller distance of the two
+directions counts (a simple form of the symmetric criterion of Harman and Müller, arXiv:1709.10320). Every
+scan has its own datum, tilt, bow, gain and affine registration. The refitted model stays consistent with
+earlier prints and within the ranges of its parameters.
 """
 
 from __future__ import annotations
@@ -37,11 +37,10 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made, as the table of the plan says it.
+    """How one scan is made, as in the table of the plan.
 
-    ``turned_deg``: by how much the print lies turned under the microscope; ``direction``: -1 with lines
-    recorded on the way back; ``tip``: 2 with another, sharp one; ``pixel_size``: of those of the scans so
-    far, with as much time for each.
+    ``turned_deg``: angle of the print under the microscope; ``direction``: -1 for the retrace; ``tip``: 2 for
+    a second, sharp tip; ``pixel_size``: relative to earlier scans, with the same time per pixel.
     """
 
     turned_deg: int = 0
@@ -54,8 +53,8 @@ class Way:
 class PlannedPrint:
     """One printed field and its scans.
 
-    ``level``: (y, x), whole or soft levels; ``place``: in the write field; ``order``: -0.5 first, 0.5 last;
-    ``dose``: relative to the prints so far.
+    ``level``: (y, x), whole or soft levels; ``place``: position in the write field; ``order``: -0.5 first,
+    0.5 last; ``dose``: relative to earlier prints.
     """
 
     level: Tensor
@@ -67,7 +66,7 @@ class PlannedPrint:
 
 @dataclass(frozen=True)
 class Printing:
-    """What all prints share: pitch, level height, highest level, write field (µm, or None)."""
+    """Common settings of all prints: pitch, level height, highest level, write field (µm, or None)."""
 
     pitch_um: float
     level_height_um: float
@@ -75,13 +74,13 @@ class Printing:
     write_field_um: float | None = None
 
     def reach_um(self, printed: PlannedPrint) -> float:
-        """How far the centre of a print lies from that of the write field, along both axes."""
+        """Largest distance from the centre of a print to the centre of the write field, along both axes."""
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
         return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
 
     def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
-        """What effects know of a planned scan."""
+        """The context of a planned scan, for effects."""
         reach_um = self.reach_um(printed)
         return FieldContext(
             layout_um,
@@ -99,17 +98,17 @@ class Printing:
         )
 
     def predict(self, chain: EffectChain, printed: PlannedPrint, way: Way) -> Tensor:
-        """Height (y, x), µm, as this scan would show it."""
+        """Height (y, x), µm, that this scan would show."""
         layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
         return chain(layout_um, self.context(layout_um, printed, way))[0, 0]
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A directed pair on some prints, one figure (prints,) per print.
+    """A directed pair of rivals on some prints; each figure has shape (prints,).
 
-    ``squares_um2``: squared distance over all pixels and scans; ``sd_um2``: standard deviation by which noise
-    moves the difference of the two squared errors; ``pixels``: of all its scans.
+    ``squares_um2``: squared distance over all pixels and scans; ``sd_um2``: standard deviation, by noise, of
+    the difference of the two squared errors; ``pixels``: number of pixels of all scans.
     """
 
     squares_um2: Tensor
@@ -136,10 +135,10 @@ class Rivalry:
     """The rivals of one question, and what they predict of planned prints.
 
     Args:
-        question: with at least two rivals.
-        base: the simulator whose numbers come first in their vectors.
+        question: a question with at least two rivals.
+        base: the simulator whose parameters come first in the rivals' vectors.
         printing: pitch and levels.
-        noise: what is left of the prints so far.
+        noise: spectrum of the residual of earlier prints.
     """
 
     def __init__(self, question: Question, base: Simulator, printing: Printing, noise: NoiseSpectrum):
@@ -147,7 +146,7 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # What is true, if a rival is; refits start from ``twins``.
+        # The rivals as possible truths; refits start from ``twins``.
         self.true = self.chains = [_chain(twin) for twin in self.twins]
 
     @property
@@ -156,7 +155,7 @@ class Rivalry:
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
-        """The same rivals, each as true with numbers that the prints so far allow as well."""
+        """Draw the rivals' true parameters within the uncertainty after earlier prints."""
         other = copy.copy(self)
         other.true = []
         for twin, rival in zip(self.twins, self.question.rivals, strict=True):
@@ -171,12 +170,12 @@ class Rivalry:
         rounds: int = 1,
         first: Sequence[list[Linearised]] | None = None,
     ) -> list[EffectChain]:
-        """For each directed pair the second model, fitted to what the first predicts.
+        """For each directed pair, fit the second model to the prediction of the first.
 
         Args:
-            prints: levels are taken as they are, without derivatives.
+            prints: planned prints; no derivatives flow to their levels.
             rounds: Gauss-Newton steps; one is the linearised refit.
-            first: the models on these prints, ``linearised``, if they are known.
+            first: the result of ``linearised`` on these prints, if known.
         """
         predicted = [self._predict(chain, prints) for chain in self.true]
         first = first or self.linearised(prints)
@@ -197,11 +196,11 @@ class Rivalry:
         return found
 
     def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
-        """The models where a refit starts, whatever it is fitted to."""
+        """Linearise all models at the start of a refit."""
         return [self._linearise(twin, prints) for twin in self.twins]
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
-        """Every directed pair on these prints; differentiable in the levels."""
+        """The contrast of every directed pair on these prints; differentiable in the levels."""
         true = [self._predict(chain, prints) for chain in self.true]
         return [
             self._contrast(true[first], self._predict(partner, prints), prints)
@@ -209,19 +208,20 @@ class Rivalry:
         ]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Distance of each directed pair (pairs,), in standard deviations; differentiable in the levels."""
+        """Separation of each directed pair (pairs,), in standard deviations; differentiable in the levels."""
         return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
     ) -> Contrast:
-        """Scans of one print share its roughness: their differences add up before the noise meets them."""
+        """Compare two models; differences are added over the scans of a print, which share its roughness."""
         found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
             squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
             for _ in printed.ways:
                 right, refitted = next(scans)
-                # The refitted model's own maps: a gain of the true one would let the other fade to nothing.
+                # Scan terms of the refitted model; with the true model's gain term, the refit could shrink to
+                # zero.
                 basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
                 inner = _inner(right - refitted)
                 flat = inner.reshape(-1)
@@ -237,7 +237,7 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
-        """Each scan of the prints; its residual is that of a height of zero."""
+        """Linearise a twin on each scan of the prints, with the residual against zero height."""
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)
         moved = [twin.at(twin.vector + one) for one in np.diag(steps)]
@@ -257,7 +257,7 @@ def _chain(twin: Twin) -> EffectChain:
 
 
 def _inner(field: Tensor) -> Tensor:
-    """Without the edge, where a model does not know what lies beyond."""
+    """Cut off the edge, where a model lacks part of the neighbourhood."""
     border = sample_border_px(min(field.shape))
     return field[border:-border, border:-border]
 
@@ -267,5 +267,5 @@ def _flat(field: Tensor) -> np.ndarray:
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Orthonormal basis (n, k) of what a scan may add by itself, on the inner pixels."""
+    """Orthonormal basis (n, k) of a scan's free terms on the inner pixels."""
     return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)

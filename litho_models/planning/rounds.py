@@ -1,4 +1,4 @@
-"""A loop with what it leaves open, and with what later prints of the same printer decide of it."""
+"""Run a loop with its open questions, and decide these with later prints of the same printer."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def close_loop(
     report: Callable[[str], None] = lambda message: None,
     **settings: Any,
 ) -> CloseLoop:
-    """Close the loop on a store, ``loop.run.close_loop``, and write what it leaves open beside it.
+    """Close the loop on a store by ``loop.run.close_loop``, and write its open questions beside the result.
 
     Args:
-        new_prints: further stores of the same printer. What is found on the first store stays as it is; the
-            new prints decide between the answers to what is open, see ``deciding``.
-        settings: of ``loop.run.close_loop``.
+        new_prints: further stores of the same printer. They decide the open questions (see ``deciding``) and
+            change nothing that was found on the first store.
+        settings: those of ``loop.run.close_loop``.
 
     Raises:
-        InputError: as there; further stores of another printer, or with a turned scan whose card
-            does not say so.
+        InputError: as ``loop.run.close_loop``; also further stores of another printer, or a turned scan whose
+            card does not state it.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
@@ -49,10 +49,10 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """The scans of a further store, checked to be of the same printer and turned as their card says.
+    """Read the scans of a further store; check that printer and orientation match the card.
 
     Raises:
-        InputError: of another printer, or turned otherwise.
+        InputError: another printer, or another orientation.
     """
     for name in ("pitch_um", "level_height_um", "levels"):
         if getattr(store, name) != getattr(first, name):
@@ -72,7 +72,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
     scans = store.scans()
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
-        # From which side a print was turned is a convention; that it was turned shows in its registration.
+        # The sense of a turn is a convention, but registration shows whether a print was turned.
         if (stated - scan.quarter_turns) % 2:
             raise InputError(
                 f"scan {scan.id} of {store.path}",

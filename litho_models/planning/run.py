@@ -1,4 +1,4 @@
-"""From a closed loop to the plan of the next prints."""
+"""Plan the next prints from a closed loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry
 
-# Prints on which the rivals are compared at last; the others are made of the same tiles.
+# Number of prints for the final comparison of rivals; further prints have the same tiles.
 _JUDGED = 2
 _FEWEST_PRINTS, _TILES = 2, 4
 _SMALLEST_PX = 64
@@ -43,15 +43,15 @@ def next_print(
     layouts: Literal["optimised", "random"] = "optimised",
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
-    """Plan the prints and scans that decide what a closed loop left open; None if nothing is open.
+    """Plan prints and scans that decide the open questions of a closed loop; None if nothing is open.
 
     Args:
         loop: folder of a closed loop.
         out: folder of the plan, which appears when complete.
-        prints: how many at most; ``field_um``: side of each.
-        seed: of random layouts; ``steps``: of the ascent of each tile.
-        layouts: ``random`` for a control: the same scans of layouts that nothing was optimised in.
-        report: told what happens, a sentence at a time.
+        prints: largest number of prints; ``field_um``: side of each.
+        seed: seed of random layouts; ``steps``: ascent steps of each tile.
+        layouts: ``random`` plans the same scans with random layouts, as a control.
+        report: gets progress messages.
 
     Raises:
         InputError: no closed loop, prints of an impossible size, or a folder with a plan of other settings.
@@ -84,7 +84,7 @@ def next_print(
         tile_px = min(TILE_PX, size_px)
         can_move = open_.write_field_um is not None and open_.write_field_um > field_um
         choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
-        # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
+        # A scan turned by 90 degrees is also a repeat, because the print was remounted.
         turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
         chosen = together(choices, turned)
         count = _TILES if size_px > tile_px else prints
@@ -121,7 +121,7 @@ def next_print(
             for one in open_.questions
         ]
         needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
-        # One print alone may have a defect.
+        # A single print may have a defect.
         planned = planned[: max([_FEWEST_PRINTS, *needed])]
         scans, maps = schedule(planned, limits, printing, seed)
         levels = np.stack([one.level.numpy() for one in planned]).astype(int)

@@ -1,1 +1,1 @@
-"""Heights of whole fields: tiles, their consistency, and what a prediction costs."""
+"""Heights of whole fields, tile by tile."""

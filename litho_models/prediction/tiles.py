@@ -1,4 +1,4 @@
-"""Whole fields of any size: tiles that are exact where the model has a receptive radius, else blended."""
+"""Predict whole fields of any size in tiles, exact for models with a receptive radius, otherwise blended."""
 
 from collections.abc import Callable
 
@@ -8,21 +8,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.results import Record
-from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.layers.gaussian import pad_field
 from litho_models.simulator import Simulator, Tile, crop_border
 
 TILE_PX = 1024
-
-
-class TileDifference(Record):
-    """How much a height changes with the crop it is predicted in, nm."""
-
-    max_nm: float
-    rms_nm: float
-    pixels: int
 
 
 def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
@@ -42,7 +32,7 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
 def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
     """Height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x - 2r), µm.
 
-    Gradients flow to the layout; computed in tiles of at most ``tile_px``, which changes nothing.
+    Gradients flow to the layout. Tiles of at most ``tile_px`` do not change the result.
 
     Raises:
         InputError: a model without a receptive radius, or a layout that has no interior.
@@ -81,7 +71,7 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
 
 
 def blend_tiles(
-    function: Callable[[Tensor, slice], Tensor], layout_um: Tensor, tile: Tile, border_px: int = 0
+    function: Callable[[Tensor], Tensor], layout_um: Tensor, tile: Tile, border_px: int = 0
 ) -> Tensor:
     """Weighted mean of ``function`` over overlapping tiles; the weights at each pixel sum to one.
 
@@ -89,8 +79,7 @@ def blend_tiles(
     that every pixel of the field has its full set of tiles.
 
     Args:
-        function: maps tiles (b, 1, T, T) and a slice that picks n of their rows to the heights of these
-            rows, (b, 1, n, T).
+        function: maps tiles (b, 1, T, T) to their heights.
         layout_um: (b, 1, y, x), any size, µm.
         tile: side T and overlap.
         border_px: outermost pixels that are left out of the result, less than half the field; tiles that
@@ -122,7 +111,7 @@ def blend_tiles(
     for y in (row * stride for row in rows):
         tiles = strips[..., y : y + size, :].unfold(-1, size, stride).permute(0, 3, 1, 2, 4)
         kept = slice(max(0, top - y), min(size, bottom - y))
-        heights = function(tiles.reshape(-1, 1, size, size), kept) * window[kept]
+        heights = (function(tiles.reshape(-1, 1, size, size)) * window)[..., kept, :]
         count = kept.stop - kept.start
         folded = functional.fold(
             heights.reshape(batch, len(columns), count * size).transpose(1, 2),
@@ -149,40 +138,6 @@ def blending_window(tile: Tile, like: Tensor) -> Tensor:
         [ramp, torch.ones(size - 2 * overlap, device=like.device, dtype=like.dtype), ramp.flip(0)]
     )
     return torch.outer(line, line)
-
-
-def tile_difference(
-    model: Simulator, layout_um: Tensor, offset_px: tuple[int, int], border_px: int
-) -> TileDifference:
-    """The same pixels predicted in the whole field and in a crop of it, which shifts all tiles.
-
-    Args:
-        model: any model; with a receptive radius the difference is rounding.
-        layout_um: field (b, 1, y, x), µm.
-        offset_px: rows and columns cut off at the top left.
-        border_px: pixels along the crop's edge that are not compared; the receptive radius, or a tile.
-
-    Raises:
-        InputError: nothing left to compare.
-    """
-    y, x = offset_px
-    crop = layout_um[..., y:, x:]
-    inner = (..., slice(border_px, crop.shape[-2] - border_px), slice(border_px, crop.shape[-1] - border_px))
-    with torch.no_grad():
-        in_crop = predict_field(model, crop)[inner]
-        in_whole = predict_field(model, layout_um)[..., y:, x:][inner]
-    if in_crop.numel() == 0:
-        raise InputError(
-            "field for a tile difference",
-            got=f"{tuple(layout_um.shape[-2:])} px",
-            wanted=f"more than {2 * border_px} px beyond the offset {offset_px}",
-        )
-    difference = (in_crop - in_whole).double() * NM_PER_UM
-    return TileDifference(
-        max_nm=float(difference.abs().max()),
-        rms_nm=float(difference.square().mean().sqrt()),
-        pixels=difference.numel(),
-    )
 
 
 def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:

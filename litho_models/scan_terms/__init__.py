@@ -1,4 +1,4 @@
-"""What a scan adds to the height, and how it is taken out on pixels that are not scored."""
+"""Terms that a scan adds to the height, and their removal by fits to pixels that are not scored."""
 
 from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.cross_fit import CrossFit, cross_fit, fitted_terms, freed_um, least_squares

@@ -1,8 +1,8 @@
-"""The smooth background that all scans of one microscope share, as a handful of numbers.
+"""The smooth background that all scans of one microscope share.
 
-Levelling a scan removes what it was told to remove and leaves the rest: a bow, say, where only planes
-were taken out. Of that, the part that is the same in every scan can be learned on the training scans
-and added to a prediction of the *measured* map. It is no part of the printer: no design sees it.
+Levelling by planes leaves, for example, a bow. The part of it that is the same in every scan is learned from
+the training scans and added to predictions of *measured* maps. It does not belong to the printer and enters
+no design.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scan_terms.policies import POLICIES
 from litho_models.scan_terms.term import FloatMap, smooth_shapes
 
-# Relative; a bow taken from a field 1 % larger or smaller is wrong by 2 %.
+# Relative tolerance of the field size. A bow from a field 1 % larger or smaller is wrong by 2 %.
 _SAME_SIZE = 0.01
 
 
 class Background(Record):
     """Mean over ``scans`` training scans of the coefficients of x, y, x², xy, y², nm.
 
-    x and y run from -1 to 1 over a field of ``field_um`` (y, x); each term has a mean of zero over it,
-    so that a background moves no datum.
+    x and y run from -1 to 1 over a field of ``field_um`` (y, x). Each term has zero mean, so a background
+    moves no datum.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -41,7 +41,7 @@ class Background(Record):
     scans: int
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Whether the scan's field has the size that this was learned on; a bow is not that of another."""
+        """Whether the scan's field has the size on which the background was learned."""
         return is_of_size(scan, self.field_um)
 
     def map_um(self, shape: tuple[int, int]) -> FloatMap:
@@ -61,13 +61,13 @@ def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
 
 
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
-    """The smooth background that the scans have in common beside a fitted model's heights.
+    """Learn the smooth background that scans share in addition to a model's predicted heights.
 
-    Each scan is fitted with all terms of policy ``full``, offset and gain included, on its valid pixels;
-    the mean over the scans of the five smooth terms is kept.
+    All terms of policy ``full``, with offset and gain, are fitted to the valid pixels of each scan. The
+    background is the mean over scans of the five smooth terms.
 
     Args:
-        scans: the scans that the model was fitted to, of one size; ``predictions_um``: its heights (ny, nx).
+        scans: training scans of one size; ``predictions_um``: the model's heights (ny, nx).
     """
     coefficients = [
         fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]

@@ -1,9 +1,9 @@
-"""Which pixels of a scan its terms are fitted on, and which are scored.
+"""Divide the pixels of a scan into those for fitting its terms and those that are scored.
 
-Terms fitted on the pixels that they are scored on flatter the model. Smooth terms are fitted on one half of
-a checkerboard and applied to the other. An offset of a line is read from a handful of pixels, and roughness
-nearby is much like theirs (its correlation is still 0.2 at 32 px along x): so offsets of lines come from the
-other side of the scan, beyond a gap.
+Terms fitted to the scored pixels would flatter the model. Smooth terms are fitted to one half of a
+checkerboard and applied to the other. The offset of a line comes from few pixels, whose roughness correlates
+with that of their neighbours (still by 0.2 at 32 px along x). Line offsets are therefore fitted on the other
+side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ BoolMap = NDArray[np.bool_]
 
 
 class Blocks(NamedTuple):
-    """Geometry of the two halves; every result records it.
+    """Geometry of the two halves, which every result records.
 
     Attributes:
         block_px: side of a block of the checkerboard.
-        buffer_px: pixels to fit on are farther than this from every pixel scored. One residual correlation
-            length of the measured prints: about 0.5 at 5 px.
-        line_gap_px: the same for offsets of lines, along the line.
+        buffer_px: fitted pixels are farther than this from every scored pixel; about one correlation length
+            of the measured prints' residuals (0.5 at 5 px).
+        line_gap_px: the same along the line, for line offsets.
         seed: moves the origin of the checkerboard.
     """
 
@@ -47,7 +47,7 @@ class Half(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A part of the scan to score, and for each axis the pixels from which offsets of lines may come."""
+    """A part of the scan to score, and for each axis the pixels for fitting line offsets."""
 
     score: BoolMap
     other_side: dict[int, BoolMap]
@@ -58,7 +58,7 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
     """Checkerboard of square blocks as two halves.
 
     Raises:
-        InputError: blocks that the buffer would eat up.
+        InputError: blocks that are too small for the buffer.
     """
     block_px, buffer_px = blocks.block_px, blocks.buffer_px
     if block_px <= 2 * buffer_px:
@@ -73,12 +73,12 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
-    """The scan cut across its lines: halves for lines along one axis, quadrants for lines along both.
+    """Cut the scan across its lines: into halves for lines along one axis, quadrants for lines along both.
 
     Args:
         shape: (ny, nx).
-        axes: axes that lines run along, 1 for lines along x.
-        gap_px: pixels along a line between a scored pixel and those its offset comes from, at least.
+        axes: axes along which lines run; 1: along x.
+        gap_px: least distance along a line from a scored pixel to the pixels that give its offset.
     """
     axes, cells = sorted(set(axes)), []
     for sides in product((False, True), repeat=len(axes)):
@@ -93,7 +93,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
 
 
 def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
-    """Flat indices of about so many of the used pixels (ny, nx), on a square lattice."""
+    """Flat indices of about ``count`` used pixels (ny, nx), on a square lattice."""
     stride = max(1, round((used.sum() / count) ** 0.5))
     lattice = np.zeros_like(used)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True

@@ -1,7 +1,7 @@
-"""A scan freed of its terms, which are fitted on pixels that are not scored.
+"""Remove a scan's terms, fitted to pixels that are not scored.
 
-A microscope's datum or a bow says nothing about the printer, so an error figure may be freed of it. Every
-figure in the project that is freed of anything comes from ``cross_fit``.
+A microscope's datum or bow says nothing about the printer, so errors may be stated without it. Every such
+error in this project comes from ``cross_fit``.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from litho_models.scan_terms.term import (
 
 @dataclass(frozen=True)
 class CrossFit:
-    """A scan freed of its terms.
+    """The residual of a scan without its terms.
 
     Attributes:
         residual_um: measured minus predicted minus terms, (ny, nx) µm, NaN where not scored.
-        degrees_of_freedom: fitted per pixel scored; the shrunk offsets of lines count with their weight.
-        line_sd_um: standard deviation of the offsets of lines, 0 without them.
+        degrees_of_freedom: effective number of terms for each scored pixel; shrunk line offsets count with
+            their weight.
+        line_sd_um: standard deviation of the line offsets, 0 without them.
     """
 
     residual_um: FloatMap
@@ -47,14 +48,14 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Residual of one scan with its terms estimated on other pixels than those scored.
+    """Residual of one scan without its terms, which are fitted to pixels that are not scored.
 
     Args:
         height_um: measured height (ny, nx), µm; NaN allowed where not valid.
         prediction_um: the model's height (ny, nx), µm.
         valid: bool (ny, nx), pixels that count.
-        terms: names of the catalogue; see ``POLICIES`` for the usual sets.
-        blocks: which pixels are fitted on; the standard ones by default.
+        terms: names in the catalogue; see ``POLICIES`` for the usual sets.
+        blocks: division of the pixels, by default the standard one.
         scan_line: index of the scan line of each pixel (ny, nx), from 0; rows of the array if None.
 
     Raises:
@@ -104,9 +105,9 @@ def fitted_terms(
     used: BoolMap,
     terms: Terms,
 ) -> tuple[FloatMap, FloatMap]:
-    """Smooth terms fitted to all used pixels: coefficients (k,) and the map that they add, (ny, nx) µm.
+    """Fit smooth terms to all used pixels; returns coefficients (k,) and the map of the terms, (ny, nx) µm.
 
-    For training, pictures and defects; a reported error takes its terms from ``cross_fit``.
+    Use it for training, pictures and defects; reported errors take their terms from ``cross_fit``.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
@@ -115,13 +116,13 @@ def fitted_terms(
 
 
 def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
-    """Measured minus predicted without its ``fitted_terms``, (ny, nx) µm; 0 at pixels that are not used."""
+    """Measured minus predicted height without ``fitted_terms``, (ny, nx) µm; 0 at unused pixels."""
     _, own = fitted_terms(height_um, prediction_um, used, terms)
     return np.where(used, height_um - prediction_um - own, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Coefficients (k, …) of ``design`` (k, n) that come closest to ``target`` (n, …)."""
+    """Least-squares coefficients (k, …) of ``design`` (k, n) for ``target`` (n, …)."""
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 
 

@@ -1,7 +1,7 @@
-"""One ridge for all that is fitted linearly to scans: columns with one strength for all, or one by group.
+"""Ridge regression over scans, for columns with a common strength or strengths by group.
 
-Of each scan only the inner products of its residual and its columns are needed. From them follow the
-strengths on any scans, and the squared error on any others.
+The inner products of residual and columns of each scan are enough. They give the strengths fitted to any
+scans and the squared error of any others.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from litho_data.store import PrintedScan
 
 Labels = tuple[str, ...]
 ALL = "all"
-# With fewer in a group, what it has in common cannot be told from what one scan has.
+# Fewest scans of a group whose common part can be told from the parts of single scans.
 FEWEST_IN_GROUP = 2
 _STATED = ("tip", "direction", "turned_deg")
 _ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
-    """The label of a scan in a grouping, by the grouping's name; empty where the scan has none."""
+    """The label of a scan in a grouping; empty if it has none."""
     if by == ALL:
         return ""
     if by in scan.groups:
@@ -33,11 +33,11 @@ def label_of(scan: PrintedScan, by: str) -> str:
     if by in _STATED:
         stated = getattr(scan, by)
         return "" if stated is None else f"{stated:g}"
-    # A group of the card may have any word for a name, but no blank in it.
+    # Names of groups in the card contain no blanks.
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
         last, first = map(int, value.split("-"))
-        # Of a scan in between nobody knows whether the change had come.
+        # A scan in between may be before or after the change.
         return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
     if value and kind == _CHARACTER:
         return scan.id[int(value) - 1 : int(value)]
@@ -45,12 +45,12 @@ def label_of(scan: PrintedScan, by: str) -> str:
 
 
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
-    """Label of each scan by grouping; ``all`` is always there and comes first.
+    """Label of each scan by grouping, with ``all`` first.
 
-    Groups come from the card (print, field, tip, direction and turn of a scan), from the ids, where each
-    character that varies may stand for a group, and, with ``by_order``, from the order: before and after
-    every place at which something may have changed. A grouping counts if it has two labels or more, at
-    least half of them of two scans or more; of two that divide the scans alike the first counts.
+    Groups come from the card (print, field, tip, direction and turn of a scan), from each varying character
+    of the ids, and, with ``by_order``, from the order: before and after every possible time of a change. A
+    grouping needs at least two labels, and at least half of them with two or more scans. Of two equal
+    groupings only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -83,7 +83,9 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Orders at which a change may have come: where a print begins, or anywhere with two scans a side."""
+    """Positions in the order at which something may have changed: between prints, or anywhere with two
+    scans on each side.
+    """
     orders = sorted({scan.order for scan in scans})
     if prints is not None:
         first = {
@@ -94,18 +96,18 @@ def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
     return orders[FEWEST_IN_GROUP : len(orders) - FEWEST_IN_GROUP + 1]
 
 
-# Of a unit diagonal: what columns that do the same are told apart by.
+# Added to a unit diagonal, so that equal columns can be solved for.
 _ALIKE = 1e-7
 
 
 @dataclass(frozen=True)
 class Block:
-    """Columns whose strengths are fitted together.
+    """Columns whose strengths are fitted jointly.
 
     Attributes:
-        columns: their numbers in the inner products, from 1; 0 is the residual.
-        by: name of the grouping; each label has strengths of its own.
-        shrinking: so many scans' worth of evidence for no strength at all; 0 for none.
+        columns: their indices in the inner products, from 1; 0 is the residual.
+        by: name of the grouping; each label has its own strengths.
+        shrinking: weight, in scans, of the prior for zero strength; 0: no prior.
     """
 
     columns: tuple[int, ...]
@@ -119,7 +121,7 @@ class Products:
 
     Attributes:
         grams: (scans, 1 + m, 1 + m), residual first, per pixel.
-        groups: by name of the grouping, a label for each scan.
+        groups: label of each scan by grouping.
     """
 
     grams: np.ndarray
@@ -127,13 +129,13 @@ class Products:
 
     @classmethod
     def ungrouped(cls, grams: np.ndarray) -> Products:
-        """Of scans that all columns have one strength for."""
+        """Inner products for columns with common strengths."""
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Of each block, by label, the strengths (columns,) that fit these scans best; ``scans``: numbers.
+        """Best strengths (columns,) for these scans, by block and label; ``scans``: indices.
 
-        Labels that none of these scans has are absent.
+        Labels without any of these scans are absent.
         """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
@@ -142,9 +144,9 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Mean squared residual (scans,) of these scans with the strengths of their groups in place.
+        """Mean squared residual (scans,) of these scans with the strengths of their groups.
 
-        Where a scan's label has no strengths it is left as it is.
+        A scan whose label has no strengths is unchanged.
         """
         left = np.empty(len(scans))
         for number, scan in enumerate(scans):
@@ -158,7 +160,7 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Mean squared residual of each scan with the strengths fitted without its fold, (scans,)."""
+        """Mean squared residual (scans,) of each scan, with strengths fitted without its fold."""
         left = np.empty(len(fold_of))
         for fold in np.unique(fold_of):
             own = np.flatnonzero(fold_of == fold)
@@ -167,10 +169,10 @@ class Products:
         return left
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """The same, residual and columns freed of what these blocks fit of them on all scans.
+        """Project these blocks, fitted to all scans, out of the residual and the other columns.
 
-        The columns of the blocks are then zero. Strengths for all scans are those of the whole fit from here
-        on; strengths by group are so as far as the groups have the same share of what was taken out.
+        The columns of the blocks become zero. Later fits of common strengths equal a joint fit. Strengths by
+        group do so only if the projected part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -181,18 +183,18 @@ class Products:
         for members, rows in expanded.alike:
             change = np.zeros(self.grams.shape[1:])
             change[rest, rest] = 1.0
-            # Columns that several blocks share count for each of them.
+            # Columns of several blocks count for each block.
             np.subtract.at(change, np.ix_(expanded.columns, rest), solved[rows])
             freed[members] = change.T @ self.grams[members] @ change
         return Products(freed, self.groups)
 
 
 class _Expanded:
-    """Normal equations with one row for each strength of each label.
+    """Normal equations with one row per strength and label.
 
     Attributes:
-        columns: of all blocks; ``rows``: of each block, by label, those of its strengths.
-        alike: scans that are in the same groups, and the rows of their strengths, as ``columns``.
+        columns: columns of all blocks; ``rows``: rows of each block's strengths, by label.
+        alike: scans in the same groups, and the rows of their strengths, in the order of ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
@@ -220,7 +222,7 @@ class _Expanded:
         self._shrunk = np.array(shrunk)
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Strengths (rows, targets) that come closest to these columns, or to the residual."""
+        """Least-squares strengths (rows, targets) for these columns, or for the residual."""
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows in self.alike:

@@ -1,4 +1,4 @@
-"""Offsets of lines: which line a pixel belongs to, and what the lines of a scan are displaced by."""
+"""Line offsets: the line of each pixel, and the offset of each line."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 def scan_line_index(
     shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
 ) -> LineIndex:
-    """Index of the scan line (constant y in the scan's frame) under each layout pixel, (ny, nx), from 0.
+    """Index, from 0, of the scan line (constant y in the scan's frame) under each layout pixel, (ny, nx).
 
     Args:
         shape: (ny, nx) of the layout.
         scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan frame to the layout frame.
         pitch_um: layout pitch; lines are counted in the same steps.
-        bend_um: of a bent scan, which ``scan_to_layout`` does not contain.
+        bend_um: bend of the scan, which ``scan_to_layout`` does not contain.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
     scan_x, scan_y, depth = (row[0] * x + row[1] * y + row[2] for row in inverse)
     scan_x, scan_y = scan_x / depth, scan_y / depth
     if bend_um is not None:
-        # What the scan does not show is given to its first or last line; the end itself is beyond the last.
+        # Pixels outside the scan belong to its first or last line.
         end = 2 * bend_um.half[1] * (1 - 1e-9)
         scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, end)
     line = np.floor(scan_y / pitch_um).astype(np.intp)
@@ -37,7 +37,7 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """The axis that lines run along: 1 for lines along x; a scan turned by 90 degrees has them along y."""
+    """The axis of the lines: 1 for lines along x, 0 for a scan turned by 90 degrees."""
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
 
@@ -45,14 +45,14 @@ def axis_along(line: LineIndex) -> int:
 def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
-    """Offsets of the lines as a variance component: best linear prediction of s_i ~ N(0, v).
+    """Estimate line offsets as a variance component: best linear prediction of s_i ~ N(0, v).
 
-    The means of blocks within a line give the noise of a line's mean (correlation along the line included);
-    what the line means vary beyond it is v. For equal counts this moment estimate is the REML one. A line
-    without used pixels gets 0.
+    The scatter of block means within a line gives the noise of the line's mean, including correlation along
+    the line. The remaining variance of the line means is v. For equal counts this moment estimate equals
+    REML. A line without used pixels gets 0.
 
     Args:
-        residual_um: (ny, nx), µm; ``used``: the pixels that count; ``line``: the line of each pixel.
+        residual_um: (ny, nx), µm; ``used``: pixels to use; ``line``: line of each pixel.
         block_px: length of a block along the lines.
 
     Returns:
@@ -66,7 +66,7 @@ def shrunk_line_offsets(
     cell = (line * block_count + block)[used]
     count = np.bincount(cell, minlength=line_count * block_count).reshape(line_count, block_count)
     total = np.bincount(cell, residual_um[used], minlength=count.size).reshape(count.shape)
-    # Blocks with a handful of pixels (the edge of the scan) would count as much as full ones.
+    # Blocks with few pixels (at the edge of the scan) are left out, because all blocks count equally.
     filled = count >= max(1, count.max() // 2)
     means = np.where(filled, total / np.maximum(count, 1), 0.0)
     blocks = filled.sum(axis=1)

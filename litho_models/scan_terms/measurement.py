@@ -1,9 +1,9 @@
-"""The measurement model: what microscope, registration and levelling make of a print, as scans share it.
+"""The measurement model: the changes by microscope, registration and levelling that scans share.
 
-A scan shows the print levelled as its file was, displaced where the scanner ran unevenly, with a gain, on a
-background. What of this all scans have in common, or all scans of a group, is learned on training scans and
-added to the prediction of any other; nothing of it is fitted to a scan that is scored. It is no part of the
-printer: no design sees it.
+A scan shows the print after levelling, with displacements by an uneven scanner, with a gain, and on a
+background. The parts that all scans, or all scans of a group, share are learned from training scans and
+applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model does not
+belong to the printer and enters no design.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that a file may have been freed of, structure included: which of x, y, x², xy, y², from 1.
+# Surfaces that may have been fitted to whole files and subtracted: which of x, y, x², xy, y², from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -38,13 +38,13 @@ LEVELLED: dict[Levelling, tuple[int, ...]] = {
 
 
 class SharedPart(Record):
-    """One thing that scans have in common.
+    """One part of the measurement model.
 
     Attributes:
-        what: ``background`` and the displacements are sums of Legendre polynomials of x and y, -1 to 1 over
-            the field, of ``degree`` in all; the gain is one number, relative.
-        by: grouping; ``coefficients``: by label, µm, or 1 for the gain. One without any adds nothing.
-        shrinking: scans' worth of evidence for no such thing that the fit went by.
+        what: ``background`` and displacements are sums of Legendre polynomials of x and y, -1 to 1 over the
+            field, up to the total ``degree``; the gain is one relative number.
+        by: grouping; ``coefficients``: by label, in µm, or 1 for the gain. A part without any adds nothing.
+        shrinking: weight, in scans, of the prior for zero in the fit.
     """
 
     what: Shared
@@ -59,22 +59,23 @@ class SharedPart(Record):
         return sum(len(own) for own in self.coefficients.values())
 
     def of(self, scan: PrintedScan) -> list[float]:
-        """The coefficients of the scan's group; empty where it has none."""
+        """The coefficients of the scan's group; empty if it has none."""
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
-        """The polynomials on the scan's field, (ny, nx) µm; a background has none of degree 0."""
+        """The sum of polynomials on the scan's field, (ny, nx) µm; a background has no constant."""
         own = self.of(scan)
         return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
 
 
 class MeasurementModel(Record):
-    """What scans share beside their prints.
+    """The changes that scans share in addition to their prints.
 
     Attributes:
-        levelling: surface that the files were freed of, structure included; taken off predictions alike.
-        parts: the rest, in the order in which it was found.
-        field_um: size (y, x) of the fields it was learned on; ``scans``: how many.
+        levelling: surface that was fitted to whole files and subtracted; predictions are treated in the same
+            way.
+        parts: further parts, in the order in which they were found.
+        field_um: size (y, x) of the training fields; ``scans``: number of training scans.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -90,13 +91,13 @@ class MeasurementModel(Record):
         return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Whether the scan's field has the size that this was learned on."""
+        """Whether the scan's field has the size of the training fields."""
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
-        """The map (ny, nx) that the microscope should show of a predicted print (ny, nx), µm.
+        """The expected scan (ny, nx) of a predicted print (ny, nx), µm.
 
-        A field of another size has its levelling only.
+        For a field of another size only the levelling is applied.
         """
         parts = self._parts(scan)
         seen = displaced(scan, prediction_um, parts)
@@ -106,14 +107,14 @@ class MeasurementModel(Record):
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
-        """The scan without what this adds to its predicted print (ny, nx), µm."""
+        """The scan without the changes that this model makes to its predicted print (ny, nx), µm."""
         added = self.expected_um(scan, prediction_um) - prediction_um
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """Only what differs between groups: the mean over the labels of a part is taken out of each of them.
+        """The model of differences between groups: each part without its mean over the labels.
 
-        Nor is a gain kept: what prints differ in may be the printer's.
+        Gains are left out, because differences between prints may come from the printer.
         """
         kept = []
         for part in self.parts:
@@ -125,17 +126,17 @@ class MeasurementModel(Record):
         return self.model_copy(update={"parts": kept, "levelling": "none"})
 
     def background_um(self, scan: PrintedScan) -> FloatMap:
-        """The background alone on the scan's field, (ny, nx) µm."""
+        """The background on the scan's field, (ny, nx) µm."""
         backgrounds = (part for part in self._parts(scan) if part.what == "background")
         return sum((part.map_um(scan) for part in backgrounds), np.zeros(scan.shape))
 
     def _parts(self, scan: PrintedScan) -> list[SharedPart]:
-        """Those that say something of the scan."""
+        """The parts that apply to the scan."""
         return [part for part in self.parts if part.of(scan)] if self.fits(scan) else []
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """A predicted print looked up where the displacements of these parts say, (ny, nx) µm."""
+    """A predicted print displaced by these parts, (ny, nx) µm."""
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
     if not moves:
@@ -148,7 +149,7 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """A field without the surface that fits it best on the usable pixels; its mean stays."""
+    """Subtract the surface that fits a field best on the usable pixels; the mean stays."""
     if levelling == "none":
         return field
     shapes = polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
@@ -159,7 +160,7 @@ def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Flo
 
 @lru_cache(maxsize=8)
 def polynomials(shape: tuple[int, ...], degree: int) -> FloatMap:
-    """Products of Legendre polynomials of y and x up to a total degree, ordered by it: (k, ny, nx)."""
+    """Products of Legendre polynomials of y and x, ordered by total degree, (k, ny, nx)."""
     y, x = (legendre.legvander(np.linspace(-1, 1, n), degree).T for n in shape)
     maps = [np.outer(y[by_y], x[total - by_y]) for total in range(degree + 1) for by_y in range(total + 1)]
     found = np.stack(maps)

@@ -1,6 +1,6 @@
-"""Learning the measurement model: which parts scans share, and how large each is.
+"""Learn the measurement model: which parts scans share, and their sizes.
 
-Parts are chosen by their gain on scans that they were not fitted to, all among the scans that are given.
+Parts are chosen by cross-validation within the given scans.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from litho_models.scan_terms.measurement import (
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# What is tried, the most likely first. A background of degree 11 turns over 9 µm in a field of 54 µm.
+# Parts to try, the most likely first. A background of degree 11 varies over 9 µm in a field of 54 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -42,17 +42,17 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Scans' worth of evidence for no difference between groups: the spread within groups over that between them.
+# Weights, in scans, of the prior for no difference between groups: variance within over variance between.
 _SHRINKING = (0.3, 1.0, 3.0)
-# A part stays if the held-out squared error falls by more than so many standard errors, and by such a share.
+# A part is kept if the held-out squared error falls by this many standard errors and by this share.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
-# Displacements are found by their derivative; the second time around it is taken at the displaced print.
+# Displacements are linearised; the second round linearises at the displaced print.
 _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# What may be shared: its degree, its columns by group. A scan with its predicted print (ny, nx), µm.
+# A part to try: its degree and grouping. A scan with its predicted print (ny, nx), µm.
 _Offer = tuple[Shared, int, Block]
 _Pair = tuple[PrintedScan, np.ndarray]
 
@@ -64,14 +64,13 @@ def learn_measurement(
     seed: int = 0,
     like: MeasurementModel | None = None,
 ) -> MeasurementModel:
-    """Choose and fit what these scans share beside the predicted prints (ny, nx), µm.
+    """Choose and fit the parts that these scans share in addition to the predicted prints (ny, nx), µm.
 
-    Parts are added one at a time as long as they lower the error on scans that they were not fitted to, dealt
-    into folds among these scans, and only if they do so beyond the scatter over scans. Where fields differ in
-    size, those of the most frequent one are learned from. Micrographs of films share nothing of the kind.
+    Parts are added one at a time while they significantly lower the cross-validated error. If fields differ
+    in size, only those of the most frequent size are used. For micrographs of films the model stays empty.
 
     Args:
-        like: a model whose levelling and parts are taken, with strengths that are fitted anew.
+        like: a model whose levelling and parts are reused, with newly fitted strengths.
     """
     usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
     model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
@@ -92,7 +91,7 @@ def learn_measurement(
 
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
-    """Inner products of what could be shared, at a model of the measurement so far."""
+    """Inner products of all parts to try, at the current measurement model."""
     grams = []
     for scan, prediction in pairs:
         rows = _rows(scan, prediction, model)
@@ -101,7 +100,7 @@ def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
 
 
 def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
-    """What to add, beginning with nothing; ``fold_of``: (scans,)."""
+    """Choose the parts to add; ``fold_of``: (scans,)."""
     chosen: list[_Offer] = []
     if len(fold_of) < 2:
         return chosen
@@ -134,7 +133,7 @@ def _offer(what: Shared, degree: int, by: str, shrinking: float) -> _Offer:
 
 
 def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
-    """The parts with their strengths."""
+    """Fit the strengths of the chosen parts."""
     fitted = products.strengths([block for *_, block in chosen], np.arange(len(products.grams)))
     return [
         SharedPart(
@@ -149,10 +148,10 @@ def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """What is to be explained and the columns (1 + m, n) at thinned pixels, without their means.
+    """Residual and columns (1 + m, n) at thinned pixels, without their means.
 
-    What the parts of the model explain is put back, to first order: their strengths are then fitted anew as
-    a whole, so that they are shrunk once, however often.
+    The contribution of the current parts is added back to first order. Their strengths are then fitted as a
+    whole and shrunk only once, whatever the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
@@ -160,7 +159,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     count, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     rows = np.empty((count + 2 * lateral + 1, len(at)))
     np.take(polynomials(scan.shape, _HIGHEST).reshape(count, -1), at, 1, out=rows[:count], mode="clip")
-    # A background is added after the levelling, so that it is not levelled itself.
+    # A background is added after levelling, so it is not levelled.
     surface, moved = rows[[0, *LEVELLED[model.levelling]]], rows[count:]
     np.multiply(rows[:lateral], slope_x, out=moved[:lateral])
     np.multiply(rows[:lateral], slope_y, out=moved[lateral:-1])
@@ -175,7 +174,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
-    """Where the columns of a part lie among the rows of a scan."""
+    """The columns of a part among the rows of a scan."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,
@@ -188,7 +187,7 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
-    """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
+    """The levelling that brings predictions closest to the scans, after a shared bow and tilt are removed."""
     rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
     for scan, prediction in pairs:
         at = thinned(scan.usable, _SAMPLED_PX)
@@ -200,12 +199,12 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
             surface = shapes[[0, *own]]
             seen = expected - least_squares(surface, expected) @ surface
             rests[levelling].append(least_squares(shapes, height - seen))
-    # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
+    # Legendre polynomials are nearly orthogonal over a field, so their spread gives the squared error.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
     return min(LEVELLED, key=lambda one: float((np.var(rests[one], axis=0) * weights)[1:].sum()))
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Number of the inner fold of each scan, dealt by a hash of its id."""
+    """Inner fold of each scan, dealt by a hash of its id."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])

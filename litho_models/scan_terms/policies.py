@@ -1,4 +1,4 @@
-"""The usual sets of scan terms by name: for figures, with the record of what was freed; for training."""
+"""The usual sets of scan terms for scores and for training, and the record of a score's protocol."""
 
 from __future__ import annotations
 
@@ -40,23 +40,22 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """What scans are freed of unless one says otherwise: films have no zero height to lose."""
+    """The default policy; films have no free zero height."""
     return "none" if film else "offset"
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """What is added to predictions unless one says otherwise."""
+    """The default background of predictions."""
     return "none" if film else "training"
 
 
 class NuisanceProtocol(Record):
-    """What a scan may be freed of before it is scored, and on which pixels that was fitted.
+    """The terms that are removed from scans before scoring, and the pixels of their fit.
 
-    ``k``: smooth terms per scan; line offsets of ``full+rows`` come on top, by their effective number, which
-    depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
-    learned on the training scans was added to the predictions, ``shared`` if they went through the whole
-    measurement model, learned there with the printer; nothing of it is fitted to the scored scan.
-    No pixel is left out for lying at the edge of a scan: ``border_px``.
+    ``k``: number of smooth terms per scan, without the effective number of line offsets of ``full+rows``,
+    which depends on the prediction (``PolicyError.k``). ``background``: ``training`` if predictions include
+    the smooth background of the training scans, ``shared`` if they include the whole measurement model;
+    nothing of it is fitted to the scored scan. ``border_px``: pixels left out at the edge of a scan, none.
     """
 
     policy: Policy = "offset"
@@ -78,25 +77,25 @@ class NuisanceProtocol(Record):
 
     @property
     def blocks(self) -> Blocks:
-        """Which pixels are fitted on and which are scored."""
+        """The division into fitted and scored pixels."""
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# Their mean over scans belongs to the process: what all scans have of them is no term of single ones.
+# The mean over scans of these terms belongs to the process, not to single scans.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
 def training_terms(policy: Policy, free_gain: bool = False) -> Terms:
-    """The terms of a policy that are fitted with a model: all, without the gain unless it is free.
+    """The terms of a policy that are fitted together with a model: all, except the gain unless it is free.
 
-    A scan's gain is partly what the layout does to the height over long distances; a model whose
-    scans may each choose their gain does not learn that.
+    Part of a scan's gain is a long-range effect of the layout, which a model cannot learn if every scan has a
+    free gain.
     """
     return policy_terms(policy) - (frozenset() if free_gain else {"gain"})
 
 
 def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
-    """Those without offsets of lines, which average out over a scan and cannot move a small model."""
+    """The same without line offsets, which average out over a scan and hardly change a small model."""
     terms = training_terms(policy, free_gain)
     return terms - {term.name for term in line_terms(terms)}
 
@@ -104,16 +103,16 @@ def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """What each scan adds to the model's height, float32 (ny, nx) µm, fitted on all its valid pixels.
+    """Terms that each scan adds to the model's height, float32 (ny, nx) µm, fitted to all its valid pixels.
 
-    For training only: a reported error takes its terms from ``cross_fit``.
+    Use it only for training; reported errors take their terms from ``cross_fit``.
     """
     fitted = [
         fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]
         for scan, prediction in zip(scans, predictions_um, strict=True)
     ]
     coefficients = np.array(fitted)
-    # The catalogue begins with offset and gain, one map each.
+    # Offset and gain come first in the catalogue, with one map each.
     pinned = len(PINNED & terms)
     coefficients[:, :pinned] -= coefficients[:, :pinned].mean(axis=0)
     maps = []

@@ -1,8 +1,7 @@
-"""The catalogue of what a single scan adds to the height, each term stated once.
+"""The catalogue of terms that a scan may add to the height.
 
-A term is a handful of smooth maps over the scan (datum, gain, bow, ...), or one offset for every line of it.
-Benchmark, training, noise and loop all take their terms from here; ``register_scan_term`` adds one of your
-own.
+A term is a set of smooth maps over the scan (datum, gain, bow, ...), or one offset for every line. Benchmark,
+training, noise and loop all use this catalogue. ``register_scan_term`` adds a term.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ Terms = frozenset[str]
 
 @dataclass(frozen=True)
 class TermPixels:
-    """The predicted height of a scan, and the pixels at which terms are wanted.
+    """The predicted height of a scan, and the pixels at which terms are evaluated.
 
     Attributes:
         prediction_um: predicted height (ny, nx), µm.
-        line: index of the scan line under each pixel (ny, nx); the rows of the array if None.
-        at: flat indices of the wanted pixels; all of them, in order, if None.
+        line: index of the scan line under each pixel (ny, nx); None: rows of the array.
+        at: flat indices of the pixels; None: all, in order.
     """
 
     prediction_um: np.ndarray
@@ -56,7 +55,7 @@ class TermPixels:
 
     @cached_property
     def time(self) -> FloatMap:
-        """Moment of the scan at which each pixel was measured: 0 first line, 1 last, (n,)."""
+        """Relative time of each pixel: 0 in the first line, 1 in the last, (n,)."""
         line = row_index(self.prediction_um.shape) if self.line is None else self.line
         return self._taken(line) / max(int(line.max()), 1)
 
@@ -67,16 +66,16 @@ class TermPixels:
 
 @dataclass(frozen=True)
 class ScanTerm:
-    """One thing that a scan adds to the height.
+    """One term that a scan adds to the height.
 
     Attributes:
-        name: as it stands in sets of terms.
-        effect: the effect that it stands for; several terms may share one. None for a control.
-        unit: of its coefficients: ``µm`` of height, ``1``, or ``px`` of displacement.
-        labels: what each map is, in words; a term of lines has one label.
-        maps: pixels to (k, n), each map of zero mean over the scan unless it is the datum itself.
-        lines: for offsets of lines: (shape, scan line index) to the index of the line under each pixel.
-        frame: for offsets of lines: whose lines they are.
+        name: its name in sets of terms.
+        effect: the effect that it represents; several terms may share one. None for a control.
+        unit: unit of its coefficients: ``µm`` of height, ``1``, or ``px`` of displacement.
+        labels: description of each map; line offsets have one.
+        maps: function of the pixels, returns (k, n); maps other than the datum have zero mean over the scan.
+        lines: for line offsets: (shape, scan line index) to the line index of each pixel.
+        frame: for line offsets: the frame of the lines.
     """
 
     name: str
@@ -89,14 +88,14 @@ class ScanTerm:
 
 
 def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
-    """The smooth maps of some terms, in the order of the catalogue: (k, n)."""
+    """The smooth maps of some terms, in the order of the catalogue, (k, n)."""
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
     count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
     return np.concatenate([np.empty((0, count)), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
-    """What the coefficients of ``term_maps`` are, with the unit in which people read them."""
+    """Names of the coefficients of ``term_maps``, with their usual units."""
     shown = {"µm": " (nm)", "px": " (px)", "1": ""}
     return [
         label + shown[term.unit]
@@ -119,20 +118,20 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def line_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """Those among these terms that are offsets of lines."""
+    """The line offsets among these terms."""
     return [term for term in chosen_terms(names) if term.lines is not None]
 
 
 def terms_of_effect(effect: str) -> Terms:
-    """The terms that stand for an effect; empty where it is none of single scans."""
+    """The terms of an effect; empty if it is not a per-scan effect."""
     return frozenset(term.name for term in SCAN_TERMS.values() if term.effect == effect)
 
 
 def register_scan_term(term: ScanTerm) -> ScanTerm:
-    """Add a term to the catalogue; returns it.
+    """Add a term to the catalogue and return it.
 
     Raises:
-        InputError: a name that is taken, or neither or both of maps and lines.
+        InputError: a name that is taken, both maps and lines, or neither.
     """
     if term.name in SCAN_TERMS:
         raise InputError("scan term", got=f"{term.name}, which exists", wanted="a new name")
@@ -158,25 +157,25 @@ def row_index(shape: tuple[int, ...]) -> LineIndex:
 
 
 def _drift(pixels: TermPixels) -> FloatMap:
-    """Exponential creep after the scan starts; what is slower still lies in the bow."""
+    """Exponential creep after the scan starts; slower creep is part of the bow."""
     time = pixels.time
     ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
     return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
 
 
 def _warp(pixels: TermPixels) -> FloatMap:
-    """What an affine error of the registration changes."""
+    """Changes by an affine error of the registration."""
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (np.ones_like(x), y, x)])
 
 
 def _distortion(pixels: TermPixels) -> FloatMap:
-    """Its quadratic part, centred: a distortion that all scans have in common then brings no shift along."""
+    """Changes by a quadratic error of the registration, centred, so a common distortion causes no shift."""
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
 
 
-# Decay of the two parts of a creep, in scan times; what is slower still lies in the bow.
+# Decay times of the two parts of a creep, in scan times; slower creep is part of the bow.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 # In the order in which they are tested.

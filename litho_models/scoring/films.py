@@ -1,4 +1,4 @@
-"""Compare films: the difference in area, and the features that are missing, extra or merged.
+"""Compare films by area and by missing, extra or merged features.
 
 A feature is a connected part of the film or of the ground within it, of at least four pixels, cut at half the
 film's height.
@@ -70,7 +70,7 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
     real = large[0][pairs[0]] & large[1][pairs[1]]
     touched = [np.bincount(own, minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
     counted = [np.bincount(own[real], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
-    # A part that touches small parts only has a partner but joins nothing.
+    # A part that touches only small parts has a partner but merges nothing.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

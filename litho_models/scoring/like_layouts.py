@@ -1,8 +1,8 @@
-"""The gamma test: how much do residuals differ where the layout around them does not?
+"""The gamma test: the difference of residuals at pixels with similar surroundings.
 
-What a model of the layout may still learn is the same in like surroundings; what differs there is noise to
-it (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of other
-scans, so that datum, gain and bow of single scans count as the noise that they are to such a model.
+A model of the layout can still learn residuals that are the same in similar surroundings; differences there
+are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of
+other scans, so datum, gain and bow of single scans count as noise.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
-# More partners would come from scans less alike; with fewer the products of two would be noisier.
+# More partners would be less similar; with fewer partners, products of two would be noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
 
 class LikePixels(NamedTuple):
-    """Pixels of several scans, each with those most like it in ``PARTNERS`` other scans.
+    """Pixels of several scans, each with its most similar pixels in ``PARTNERS`` other scans.
 
     Attributes:
         owner: number of the scan of each pixel, (n,); ``pixel``: its flat index in that scan, (n,).
@@ -35,10 +35,10 @@ class LikePixels(NamedTuple):
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
         """Each pixel's estimate of the variance of its noise, and its squared residual, (n,) each.
 
-        Each residual r₀, r₁ ... r_m is noise plus a misfit that like surroundings share. The mean of
-        (r₀ − r_j)(r₀ − r_k), j ≠ k, is then the variance of the noise in r₀ alone, whatever the noise of the
-        partners. Half a squared difference would be too small for rare surroundings: they are rougher than
-        the commoner ones that become their partners.
+        Each residual r₀, r₁ ... r_m is noise plus a misfit that similar surroundings share. The mean of (r₀ −
+        r_j)(r₀ − r_k), j ≠ k, is then the variance of the noise in r₀ alone, whatever the noise of the
+        partners. Half a squared difference would be too small for rare surroundings, which are rougher than
+        their partners.
 
         Args:
             residuals: one map per scan, (ny, nx); the result is in their unit squared.
@@ -53,9 +53,9 @@ class LikePixels(NamedTuple):
 
 
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
-    """Draw pixels and find for each those of other scans whose layout surroundings are most like its own.
+    """Draw pixels, and find for each the pixels of other scans with the most similar surroundings.
 
-    Scans of different doses differ even where layouts are alike: only prints of one dose are compared.
+    Only prints of one dose are compared, because doses change the height even for equal layouts.
 
     Args:
         scans: at least three of one dose, with layouts that vary; otherwise the result is None.
@@ -96,18 +96,22 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """What the surroundings of each pixel look like: blurred layouts and two slopes, (k, ny·nx), µm."""
-    from scipy.ndimage import gaussian_filter
-
-    layout = scan.layout_um.astype(np.float64)
-    maps = [gaussian_filter(layout, sigma / scan.pitch_um, mode="nearest") for sigma in _BLURS_UM]
-    slopes = np.gradient(gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest"))
+    """Features of each pixel's surroundings: blurred layouts and two slopes, (k, ny·nx), µm."""
+    maps = [blurred_layout_um(scan, sigma_um) for sigma_um in _BLURS_UM]
+    slopes = np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM))
     maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
     return np.stack([field.ravel() for field in maps])
 
 
+def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
+    """The layout of a scan, blurred by a Gaussian, (ny, nx) float64; its outermost pixels are continued."""
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(scan.layout_um.astype(np.float64), sigma_um / scan.pitch_um, mode="nearest")
+
+
 def _whitened(feature: Array) -> Array:
-    """Features of unit covariance, so that the distance does not depend on their scale."""
+    """Scale features to unit covariance, so distances do not depend on their scale."""
     centred = feature - feature.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov(centred.T))
     kept = values > 1e-9 * values.max()

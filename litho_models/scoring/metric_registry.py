@@ -1,7 +1,7 @@
-"""Metrics of a scan besides its errors: each states its name, unit and meaning once; every report shows it.
+"""Further metrics of a scan, each with name, unit and meaning; every report shows them.
 
-A metric sees one scan, what the model expects of it, and the residual freed of the scan's nuisances. Those
-that come with the package are fields of the results; registered ones are listed there under ``metrics``.
+A metric gets one scan, the model's prediction, and the residual without the scan's nuisances. Built-in
+metrics are fields of the results; registered ones are listed under ``metrics``.
 """
 
 import math
@@ -22,7 +22,7 @@ MetricFunction = Callable[[PrintedScan, Array, Array], float | None]
 
 
 class Metric(NamedTuple):
-    """The name of a metric, and how its values for scans become the value for a model."""
+    """The name of a metric, and the rule that combines its values over scans."""
 
     name: str
     unit: str
@@ -35,9 +35,9 @@ class Metric(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """Metrics that one function returns together, in this order, and a sentence that explains them.
+    """Metrics that one function returns, in this order, with a sentence that explains them.
 
-    ``instrument``: the kind whose scans have them; all kinds if empty.
+    ``instrument``: kind of instrument whose scans have them; empty: all kinds.
     """
 
     metrics: tuple[Metric, ...]
@@ -78,7 +78,7 @@ def register_metric(
 
     ``function(scan, prediction_um, residual_um)`` gets the ``PrintedScan``, the predicted map and the
     measured minus predicted map freed of its nuisances, (ny, nx) in µm, NaN where not scored. It returns a
-    number, or None where there is nothing to measure. Example::
+    number, or None if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
@@ -113,7 +113,7 @@ def registered_metrics() -> list[Metric]:
 
 
 def metrics_text() -> str:
-    """What the metrics are, in sentences."""
+    """Explain the metrics in sentences."""
     return " ".join(measurement.explanation for measurement in _MEASUREMENTS)
 
 
@@ -133,7 +133,7 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
 
 
 def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
-    """The metrics of a model from those of its scans: means of what is known, or sums, as fields."""
+    """Combine the metrics of scans into those of a model: means of known values, or sums, as fields."""
     values = {}
     for metric in registered_metrics():
         if not any(metric.key in ScanRow.model_fields or metric.key in row.metrics for row in rows):
@@ -145,7 +145,7 @@ def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
 
 
 def _as_fields(values: Mapping[str, float | None]) -> dict[str, Any]:
-    """Metrics of the package as fields of their own, all others under ``metrics``."""
+    """Arrange built-in metrics as fields, and all others under ``metrics``."""
     own = {key: value for key, value in values.items() if key in ScanRow.model_fields}
     return {**own, "metrics": {key: value for key, value in values.items() if key not in own}}
 

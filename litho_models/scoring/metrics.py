@@ -18,16 +18,14 @@ INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """Measured height = slope · prediction + intercept; standard errors and correlation of the two.
+    """Measured height = slope · prediction + intercept, and the standard error of the slope.
 
-    NaN where they cannot be known: a constant prediction has no slope, a single block no errors.
+    None where they cannot be known: a constant prediction has no slope, a single block no error.
     """
 
-    slope: float
+    slope: float | None
     intercept_nm: float
-    slope_error: float
-    intercept_error_nm: float
-    slope_intercept_correlation: float
+    slope_error: float | None
 
 
 def print_gain(
@@ -35,7 +33,7 @@ def print_gain(
 ) -> PrintGain:
     """Least-squares line through the used pixels of a scan.
 
-    Neighbouring pixels share their residual, so the covariance is that of whole blocks (Liang and Zeger
+    Neighbouring pixels share their residual, so the variance is that of whole blocks (Liang and Zeger
     1986): the sums of residual times regressor over a block are taken as independent from block to
     block, which holds where blocks are wide against the correlation length (7 px on the measured prints).
 
@@ -44,30 +42,18 @@ def print_gain(
         block_px: side of a block.
     """
     x, y = (np.asarray(a, np.float64)[used] for a in (prediction_um, height_um))
-    middle = x.mean()
+    middle, height = float(x.mean()), float(y.mean())
     power = float(((x - middle) ** 2).sum())
     if power <= 0:
-        nan = float("nan")
-        return PrintGain(nan, NM_PER_UM * float(y.mean()), nan, nan, nan)
-    # With the mean of the prediction as origin, estimates of slope and height are uncorrelated.
-    regressors = np.stack([np.full(x.size, 1 / x.size), (x - middle) / power])
-    height, slope = regressors @ y
-    residual = y - height - slope * (x - middle)
+        return PrintGain(None, NM_PER_UM * height, None)
+    regressor = (x - middle) / power
+    slope = float(regressor @ y)
     rows, columns = np.nonzero(used)
     block = (rows // block_px) * (used.shape[1] // block_px + 1) + columns // block_px
-    influence = np.stack([np.bincount(block, weights=own * residual) for own in regressors])
+    influence = np.bincount(block, weights=regressor * (y - height - slope * (x - middle)))
     count = np.unique(block).size
-    covariance = influence @ influence.T * (count / (count - 1) if count > 1 else np.nan)
-    to_line = np.array([[1.0, -middle], [0.0, 1.0]])
-    (intercept_variance, shared), (_, slope_variance) = to_line @ covariance @ to_line.T
-    errors = float(np.sqrt(slope_variance)), float(np.sqrt(intercept_variance))
-    return PrintGain(
-        slope=float(slope),
-        intercept_nm=NM_PER_UM * float(height - slope * middle),
-        slope_error=errors[0],
-        intercept_error_nm=NM_PER_UM * errors[1],
-        slope_intercept_correlation=float(shared / np.prod(errors)) if min(errors) > 0 else float("nan"),
-    )
+    error = float(np.sqrt((influence**2).sum() * count / (count - 1))) if count > 1 else None
+    return PrintGain(slope, NM_PER_UM * (height - slope * middle), error)
 
 
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
@@ -84,8 +70,6 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
     height, prediction = (np.asarray(a, np.float64)[scored] for a in (height_um, prediction_um))
     plain = (height - prediction) * NM_PER_UM
     error = np.abs(free.residual_um[scored]) * NM_PER_UM
-    line = print_gain(height_um, prediction_um, scored)
-    known = {name: None if np.isnan(value) else value for name, value in line._asdict().items()}
     return ScanErrors(
         pixels=int(scored.sum()),
         mae_abs_nm=float(np.abs(plain).mean()),
@@ -94,7 +78,7 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
         rmse_datum_free_nm=rms(error),
         median_abs_datum_free_nm=float(np.median(error)),
         p95_abs_datum_free_nm=float(np.quantile(error, 0.95)),
-        **known,
+        **print_gain(height_um, prediction_um, scored)._asdict(),
     )
 
 

@@ -1,7 +1,7 @@
-"""The noise floor of a dataset: the error that no model of the layout can go below, for each set of terms.
+"""The noise floor of a dataset: the smallest possible error of any model, for each set of terms.
 
-Measured on flat or repeated prints where there are any; else estimated from the out-of-fold residuals of a
-model, by comparing pixels of like layout surroundings (``like_layouts``).
+It is measured on flat or repeated prints if there are any. Otherwise it is estimated from the out-of-fold
+residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +24,7 @@ NOISE_FILE = "noise.json"
 
 
 class PolicyFloor(Record):
-    """The floor under the errors of one nuisance policy, nm, with 95 % intervals over prints.
+    """The floor of the errors under one nuisance policy, nm, with 95 % intervals over prints.
 
     ``k``: terms per scan, the effective number where lines have offsets. No interval with fewer than six
     prints.
@@ -39,7 +39,7 @@ class PolicyFloor(Record):
 
 
 class NoiseFloor(Record):
-    """The error that noise alone would leave; ``kind`` says how it is known.
+    """The error by noise alone; ``kind`` states how it was estimated.
 
     ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``; ``by_policy`` has a floor for each policy and
     is empty where only that one is known, and in older result files. Kinds ``lower-bound`` and ``literature``
@@ -53,7 +53,7 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """The floor below the errors of this policy; None if it is not known."""
+        """The floor of the errors under this policy; None if unknown."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
@@ -71,7 +71,7 @@ UNKNOWN_FLOOR = NoiseFloor(
 
 
 class _StatedFloor(Result):
-    """The part of a noise analysis that is read here: its dataset, and the floor."""
+    """The parts of a noise analysis that this module reads: its dataset and the floor."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -83,7 +83,7 @@ class _StatedFloor(Result):
 
 
 def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
-    """The floor that a noise analysis found; unknown without one.
+    """The floor from a noise analysis; unknown without one.
 
     Args:
         dataset_name: name of the dataset whose errors are reported.
@@ -107,7 +107,7 @@ def estimated_floor(
     blocks: Blocks | None = None,
     seed: int = 0,
 ) -> NoiseFloor:
-    """An upper estimate of the floor under every policy, from predictions of scans not seen in training.
+    """Estimate an upper limit of the floor under every policy, from predictions of held-out scans.
 
     Args:
         model: its name, for ``source``.
@@ -124,7 +124,7 @@ def freed_by_policy(
     blocks: Blocks | None = None,
     policies: Iterable[Policy] = tuple(POLICIES),
 ) -> dict[Policy, list[CrossFit]]:
-    """Each scan freed of the terms of each policy; ``maps_um``: (ny, nx) µm, expected of it."""
+    """Residuals of each scan under each policy; ``maps_um``: expected maps (ny, nx), µm."""
     return {
         policy: [
             cross_fit(scan.height_um, expected, scan.usable, POLICIES[policy], blocks)
@@ -140,13 +140,13 @@ def floor_of_residuals(
     freed: Mapping[Policy, Sequence[CrossFit]],
     seed: int = 0,
 ) -> NoiseFloor:
-    """An upper estimate of the floor, from residuals of scans that a model had not seen.
+    """Estimate an upper limit of the floor from the residuals of held-out scans.
 
-    On drawn pixels ``LikePixels`` finds the part of the squared error that like surroundings do not share.
+    On drawn pixels ``LikePixels`` finds the part of the squared error that similar surroundings do not share.
     The floor is the error over all scored pixels times the root of this part. For the mean absolute error
-    this assumes that the noise has the shape, E|n|/σ, of the residual, which is noise but for a few
-    percent of its squares: no Gaussian is assumed. If a misfit had half of the squares and another shape
-    (Laplace in Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
+    this assumes that noise and residual have the same shape, E|n|/σ; noise makes up nearly all of the
+    residual, so no Gaussian is assumed. If a misfit of another shape had half of the squares (Laplace in
+    Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.
@@ -154,7 +154,7 @@ def floor_of_residuals(
         freed: from ``freed_by_policy``, including ``offset``.
         seed: decides which pixels are drawn.
     """
-    # In the order of their ids, so that whoever asks about the same scans draws the same pixels.
+    # In the order of their ids, so the same scans always give the same pixels.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
     scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]

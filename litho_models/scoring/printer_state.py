@@ -1,4 +1,4 @@
-"""What one scan says about the state of the printer: gain, error, and the kind of layout."""
+"""Figures of one scan for the state of the printer: gain, error, and the kind of layout."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,9 +21,9 @@ class ScanFigures(Record):
 
     ``gain``: measured over predicted height, with its standard error (of blocks, see ``print_gain``; None for
     a single block). ``error_nm``: mean absolute error with the gain free too (policy ``full``, k = 7), terms
-    fitted on other pixels. ``order``: of printing. ``relief_nm``: standard deviation of the predicted height,
-    and ``steepness`` its rms slope, which tell layouts of one kind from others. ``held_out``: whether the
-    prediction is of a model that had not seen the scan.
+    fitted on other pixels. ``order``: of printing. ``relief_nm`` and ``steepness``: standard deviation and
+    rms slope of the predicted height, which characterise the layout. ``held_out``: whether the model was not
+    trained on the scan.
     """
 
     scan: str
@@ -42,13 +42,13 @@ class ScanFigures(Record):
 def scan_figures(
     scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
 ) -> ScanFigures | None:
-    """Figures of a scan; None where the layout is flat, so that there is no gain.
+    """Figures of a scan; None for a flat layout, which has no gain.
 
-    Offset, tilt and bow are taken out of height and prediction alike, which gives the gain that a joint fit
-    of all terms would (Frisch and Waugh 1933).
+    Offset, tilt and bow are removed from both height and prediction, which gives the same gain as a joint fit
+    of all terms (Frisch and Waugh 1933).
 
     Args:
-        scan: the scan; ``prediction_um``: what the model expects of it, (ny, nx) µm.
+        scan: the scan; ``prediction_um``: expected map (ny, nx), µm.
         held_out: whether the model had not seen it.
 
     Raises:
@@ -63,14 +63,14 @@ def scan_figures(
         for part in (scan.height_um, prediction_um)
     )
     line = print_gain(height, expected, used, block_px=blocks.block_px)
-    if np.ptp(scan.mask_level) == 0 or not np.isfinite(line.slope):
+    if np.ptp(scan.mask_level) == 0 or line.slope is None:
         return None
     return ScanFigures(
         scan=scan.id,
         print=scan.print_id,
         order=scan.order,
         gain=line.slope,
-        gain_error=line.slope_error if np.isfinite(line.slope_error) else None,
+        gain_error=line.slope_error,
         error_nm=NM_PER_UM * float(np.abs(residual[used]).mean()),
         pixels=int(used.sum()),
         relief_nm=NM_PER_UM * float(expected[used].std()),
@@ -83,7 +83,7 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Figures of the scans that a model was made of, for its card; none where fields are too small."""
+    """Figures of a model's training scans, for its card; none if fields are too small."""
     pairs = zip(scans, predictions_um, strict=True)
     try:
         rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -25,25 +25,25 @@ LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_
 
 
 class Prediction(NamedTuple):
-    """What a model expects of a scan, (ny, nx) µm: the print, and what all scans add, if that is known."""
+    """The expected scan of a model, (ny, nx) µm: the print, and the part that scans share, if known."""
 
     height_um: Array
     background_um: Array | None = None
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """The print and a learned background on its field, where there is one."""
+        """A print with a learned background on its field, if there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
-        """The print, and what a learned measurement model makes of it on the scan's field."""
+        """A print with a learned measurement model on the scan's field."""
         return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
     def map_um(self) -> Array:
-        """The map that the microscope should show."""
+        """The expected map of the microscope."""
         return self.height_um if self.background_um is None else self.height_um + self.background_um
 
 
@@ -79,10 +79,13 @@ class MetricValues(Record):
 class ScanErrors(Record):
     """Error of one model on one scan over the scored pixels.
 
-    ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are freed of
-    terms fitted on other pixels. Slope and intercept, the gain and offset of the print against the
-    prediction, have standard errors and a correlation (``print_gain``); None where they cannot be known.
+    ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free`` terms
+    fitted on other pixels are removed. Slope and intercept are the gain and offset of the print against the
+    prediction (``print_gain``).
     """
+
+    # Older results also have the error of the intercept.
+    model_config = ConfigDict(extra="ignore")
 
     pixels: int
     mae_abs_nm: float
@@ -94,8 +97,6 @@ class ScanErrors(Record):
     slope: float | None
     intercept_nm: float
     slope_error: float | None = None
-    intercept_error_nm: float | None = None
-    slope_intercept_correlation: float | None = None
 
 
 class ScanRow(MetricValues, ScanErrors):
@@ -106,12 +107,15 @@ class ScanRow(MetricValues, ScanErrors):
 
 
 class ModelScores(MetricValues):
-    """Everything reported about one model; means are over scans, counts are sums, intervals resample scans.
+    """All scores of one model: means over scans, sums of counts, and intervals from resampled scans.
 
-    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies
-    that have no smooth terms themselves; it is empty where the protocol has no background.
-    ``phase_rms_waves`` is the RMS error seen by light that passes the print.
+    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
+    have no smooth terms themselves; it is empty where the protocol has no background. ``phase_rms_waves`` is
+    the RMS phase error of light that passes the print.
     """
+
+    # Older results also have the spread of line offsets.
+    model_config = ConfigDict(extra="ignore")
 
     model: str
     scans: list[ScanRow]
@@ -129,8 +133,6 @@ class ModelScores(MetricValues):
     phase_rms_waves: float | None = None
     by_level: list[LevelError]
     transfer: TransferCurves
-    row_offset_sd_nm: float
-    scan_line_offset_sd_nm: float
     dropped_pixels: int
     constant_predictions: int
 
@@ -147,7 +149,7 @@ class ModelScores(MetricValues):
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """The same of every scan by id; not a number where there is no edge."""
+        """The leading error of every scan by id; NaN without an edge."""
         values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
         return {scan: math.nan if value is None else value for scan, value in values.items()}
 

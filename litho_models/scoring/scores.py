@@ -1,4 +1,4 @@
-"""One routine that scores every model: predictions of scans in, one validated record out."""
+"""Score a model: from predictions of scans to one validated record."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,15 +7,15 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scan_terms import POLICIES, CrossFit, NuisanceProtocol, Policy, cross_fit, scan_line_index
+from litho_models.scan_terms import CrossFit, NuisanceProtocol, Policy
 from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import phase_waves, scan_errors
 from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import ModelScores, PolicyError, Prediction, ScanRow
-from litho_models.scoring.statistics import interval, rms
+from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms of their own: only their errors depend on a smooth background.
+# Policies without smooth terms, the only ones whose errors depend on a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 
@@ -27,13 +27,10 @@ def score_model(
 ) -> ModelScores:
     """Score the predictions of one model on whole scans under one protocol and, beside it, all policies.
 
-    ``row_offset_sd_nm`` and ``scan_line_offset_sd_nm`` say in which frame line offsets live: along the
-    layout's rows (the print) or along the scan's own lines (the microscope).
-
     Args:
         name: name of the model.
-        scans: the scans; ``predictions``: what the model expects of each.
-        protocol: what scans are freed of, and whether the predictions have backgrounds.
+        scans: the scans; ``predictions``: the model's prediction of each.
+        protocol: terms to remove from scans, and whether the predictions include backgrounds.
 
     Raises:
         InputError: predictions that are not finite, or a scan too small for the policies.
@@ -43,14 +40,11 @@ def score_model(
     heights = [prediction.height_um for prediction in predictions]
     freed = freed_by_policy(scans, maps, blocks)
     bare = _BLIND_POLICIES if protocol.background != "none" else ()
-    chosen, along = freed[protocol.policy], POLICIES["full"] | {"scan-lines"}
-    rows, scan_lines = [], []
+    chosen, rows = freed[protocol.policy], []
     for scan, expected, fit in zip(scans, maps, chosen, strict=True):
         errors = scan_errors(scan.id, scan.height_um, expected, fit).model_dump()
         metrics = metrics_of(scan, expected, fit.residual_um)
         rows.append(ScanRow(scan=scan.id, print=scan.print_id, **errors, **metrics))
-        line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
-        scan_lines.append(cross_fit(scan.height_um, expected, scan.valid, along, blocks, scan_line=line))
     residuals = [fit.residual_um for fit in chosen]
     over_scans: dict[str, Any] = {"bias_nm": float(np.mean([row.bias_nm for row in rows]))}
     for figure in ("mae_abs", "mae_datum_free", "rmse_datum_free"):
@@ -68,8 +62,6 @@ def score_model(
         **metrics_over_scans(rows),
         by_level=level_errors(scans, residuals),
         transfer=transfer_curves(scans, maps),
-        row_offset_sd_nm=_line_sd_nm(freed["full+rows"]),
-        scan_line_offset_sd_nm=_line_sd_nm(scan_lines),
         dropped_pixels=sum(int(np.sum(~np.isfinite(r))) for r in residuals),
         constant_predictions=sum(bool(np.ptp(height) == 0) for height in heights),
     )
@@ -82,7 +74,3 @@ def _policy_errors(freed: Mapping[Policy, Sequence[CrossFit]]) -> list[PolicyErr
         k = float(np.mean([fit.degrees_of_freedom for fit in fits]))
         found.append(PolicyError(policy=policy, k=k, mae_nm=float(np.mean(values)), ci95_nm=interval(values)))
     return found
-
-
-def _line_sd_nm(fits: Sequence[CrossFit]) -> float:
-    return NM_PER_UM * rms([fit.line_sd_um for fit in fits])

@@ -1,8 +1,8 @@
 """The shape of a printed map: structural similarity, and edge placement.
 
-For edges both maps are cut at the heights half way between nominal levels, which no model moves. Contours
-are those of marching squares, so a position is a linear interpolation between pixels; nothing is smoothed,
-and the roughness of the measured contour is part of the error.
+Edges are contours of both maps at the heights halfway between nominal levels. Marching squares interpolate
+their positions linearly between pixels. Nothing is smoothed, so the roughness of the measured contour is part
+of the error.
 """
 
 from typing import NamedTuple
@@ -39,8 +39,8 @@ EDGES_TEXT = (
 class EdgePlacement(NamedTuple):
     """Distances of the measured contours' pieces (at most a pixel long) from the expected contour.
 
-    A piece has a partner where the expected contour of the same height passes within the search and
-    rises to the same side. ``mean_nm`` and ``p95_nm`` are over pieces with one, None if there are none.
+    A piece has a partner if the expected contour of the same height passes within the search distance and
+    rises to the same side. ``mean_nm`` and ``p95_nm`` cover pieces with a partner; None if there are none.
     """
 
     mean_nm: float | None
@@ -78,7 +78,7 @@ def structural_similarity(measured_um: Array, expected_um: Array) -> float | Non
         measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape.
 
     Returns:
-        None where no window lies within the scored pixels.
+        None if no window lies within the scored pixels.
     """
     from scipy.ndimage import minimum_filter
     from skimage.metrics import structural_similarity as ssim
@@ -113,7 +113,7 @@ def edge_placement(
         measured_um: (ny, nx) µm, NaN where not scored; contours end there in both maps.
         expected_um: (ny, nx) µm.
         heights_um: heights of the contours, µm, see ``mid_step_heights_um``; ``pitch_um``: of the maps, µm.
-        search_um: how far a partner may lie.
+        search_um: largest distance of a partner.
     """
     expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
     distances, missing, unexpected = [np.empty(0)], 0, 0

@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
-# With fewer, no arrangement of signs is as rare as one in 20: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
+# Fewest units for p below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
@@ -20,7 +20,7 @@ _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 # Up to this many scans every combination of signs is used. A screening tests all directions at once and stops
 # one scan earlier than a comparison of two models, which halves its table.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
-# The observed signs are among the flips; rounding must not put their sum below the observed one.
+# The flips include the observed signs, whose sum must not fall below itself by rounding.
 _ROUNDING = 1 - 1e-12
 
 
@@ -57,9 +57,9 @@ def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> t
     Args:
         values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
     """
-    names = list(dict.fromkeys(groups))
-    member = np.array([names.index(group) for group in groups], np.intp)[owner]
-    sums, counts = np.bincount(member, values), np.bincount(member)
+    sums, counts = (
+        _by_group(np.bincount(owner, own, minlength=len(groups)), groups)[0] for own in (values, None)
+    )
     seen = counts > 0
     if seen.sum() < FEWEST_FOR_INTERVAL:
         return None
@@ -73,7 +73,7 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
     return float(low), float(high)
 
 
-def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
+def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
     """Sum and count of the values of each group; each value by itself without groups."""
     sample = np.asarray(values, np.float64)
     if groups is None:
@@ -109,9 +109,9 @@ def smallest_flip_p(count: int) -> float:
 
 
 class OverUnits(Record):
-    """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
+    """The mean of a difference over scans, with interval and p by resampling whole scans or prints.
 
-    ``count``: of units; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
+    ``count``: number of units; ``positive``: units with a positive difference. ``ci95_nm``: bootstrap
     interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, all combinations up
     to 14 units and 9,999 random ones beyond, the observed one counted in; not below ``smallest_p``.
     """
@@ -126,7 +126,7 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """A difference per scan, resampled over scans, or over ``groups``, the print of each scan.
+    """Resample a difference per scan over scans, or over ``groups`` (the print of each scan).
 
     Raises:
         InputError: no difference.
@@ -146,7 +146,7 @@ def over_units(
 
 
 def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
-    """A difference per scan, resampled over the ``prints`` of the scans; None for a single print."""
+    """Resample a difference per scan over ``prints``; None for a single print."""
     return over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
 
 
@@ -166,14 +166,14 @@ class ByPrint(Record):
 
 
 def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrint | None:
-    """Test whether scans of one print are more alike than scans of different prints.
+    """Test whether scans of one print are more similar than scans of different prints.
 
     Args:
         values: (scans,) or (scans, k) estimates; columns count alike, each in units of its spread.
         prints: print of each scan.
 
     Returns:
-        None where one cannot tell: a single print, no print with two scans, or estimates that do not vary.
+        None for a single print, without a print of two scans, or for constant estimates.
     """
     names, members = np.unique(np.asarray(prints, str), return_inverse=True)
     columns = np.reshape(values, (len(members), -1)).astype(np.float64)

@@ -1,10 +1,10 @@
-"""How an error depends on the level and on the spatial frequency."""
+"""The dependence of an error on level and spatial frequency."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
@@ -29,10 +29,9 @@ class TransferCurves(Record):
     """Prediction against measurement per frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
 
     ``error_psd``: one-sided density of the error's power along lines, nm² per cycle/µm, line means removed.
-    ``half_power``: frequency at which the gain first falls below 1/√2 of that of the lowest band, 1/µm; None
-    if it never does. ``noise_band``: width of the ideal low pass that lets as much white noise through, 1/µm.
-    None or empty in older result files.
     """
+
+    model_config = ConfigDict(extra="ignore")
 
     frequency_per_um: list[float]
     gain_x: list[float]
@@ -41,10 +40,6 @@ class TransferCurves(Record):
     coherence_y: list[float]
     error_psd_x: list[float] = Field(default_factory=list)
     error_psd_y: list[float] = Field(default_factory=list)
-    half_power_x_per_um: float | None = None
-    half_power_y_per_um: float | None = None
-    noise_band_x_per_um: float | None = None
-    noise_band_y_per_um: float | None = None
 
 
 def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
@@ -86,30 +81,12 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
         along_y += _band_powers(height.T, prediction.T, pitch, edges)
     curves: dict[str, Any] = {"frequency_per_um": frequency.tolist()}
     for axis, (cross, measured, predicted, error, lines) in (("x", along_x), ("y", along_y)):
-        gain = np.abs(cross) / np.maximum(measured, _TINY)
         curves |= {
-            f"gain_{axis}": gain.tolist(),
+            f"gain_{axis}": (np.abs(cross) / np.maximum(measured, _TINY)).tolist(),
             f"coherence_{axis}": (cross**2 / np.maximum(measured * predicted, _TINY)).tolist(),
             f"error_psd_{axis}": (NM_PER_UM**2 * error / np.maximum(lines, 1)).tolist(),
-            f"half_power_{axis}_per_um": half_power_frequency(frequency, gain),
-            f"noise_band_{axis}_per_um": noise_equivalent_band(frequency, gain),
         }
     return TransferCurves(**curves)
-
-
-def half_power_frequency(frequency: Array, gain: Array) -> float | None:
-    """Where a gain (bands,) first falls below 1/√2 of the lowest band's, linear between bands; or None."""
-    limit = np.sqrt(0.5) * gain[0]
-    below = np.flatnonzero(gain < limit)
-    if not below.size:
-        return None
-    crossing = slice(below[0] - 1, below[0] + 1)
-    return float(np.interp(-limit, -gain[crossing], frequency[crossing]))
-
-
-def noise_equivalent_band(frequency: Array, gain: Array) -> float | None:
-    """∫ gain² df over the gain² of the lowest band, for equal bands; None where that one is zero."""
-    return float(np.sum(gain**2) * (frequency[1] - frequency[0]) / gain[0] ** 2) if gain[0] > 0 else None
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:

@@ -1,1 +1,1 @@
-"""Which scans are learned from, which are held out, which stay locked."""
+"""Division of scans into training, held-out and locked ones."""

@@ -1,4 +1,4 @@
-"""Which scans are learned from and which are predicted; ``litho_data.store.lock_box`` says which stay locked.
+"""Divide scans into training and held-out ones; ``litho_data.store.lock_box`` chooses the locked ones.
 
 The unit is the whole scan, because the quadrants of one scan share its datum, tip and day. Every
 choice follows from a hash of the ids and a seed, so the same ids always give the same split.
@@ -80,7 +80,7 @@ def plan_folds(
     """The folds of a split; scans of the lock box are in none of them, except for ``paper``, which leaks.
 
     Raises:
-        InputError: too few scans, a lock box to open where there is none, or an unknown split.
+        InputError: too few scans, no lock box to open, or an unknown split.
     """
     if split == "paper":
         held_out = paper_draw([scan.id for scan in scans], seed)

@@ -101,7 +101,7 @@ MAPS: dict[str, Made] = {
     "a Gaussian blur": by_torch(lambda height: gaussian_blur(height, 0.21, 0.1)),
     "a print in tiles": printed,
     "a crop over the corner": lambda height, grid: cut(
-        height, Window(0, grid.shape[0] - 9, grid.shape[1] - 9, 16, (True, True)), 5
+        height, Window(0, grid.shape[0] - 9, grid.shape[1] - 9, 16), 5
     ),
     "light, by rays": light(ASMPropagator, 3.0),
     "light, summed": light(RSPropagator, 9.0),

@@ -8,15 +8,39 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
+from typer.main import get_command
 
+from litho_data.cli.app import app as data
+from litho_design.cli.app import app as design
+from litho_models.cli.app import app as models
 from tests.stopped_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 # One of each way to write a folder: a store, parts that grow, a whole folder, a plan from kept tiles, a file.
 QUICK = ("build", "train-network", "freeze", "next-print", "export-design")
+# One file, or a folder whose parts are those of other commands.
+ELSEWHERE = {"level", "predict", "sheet-read"}
+
+
+def test_every_command_that_writes_a_folder_is_stopped() -> None:
+    """Of one name in several packages each has its own."""
+    for app in (data, models, design):
+        for name, command in _commands(get_command(app)):
+            if name not in ELSEWHERE and any(one.name == "out" for one in command.params):
+                assert any(one == name or one.startswith(f"{name}-") for one in COMMANDS), name
+
+
+def _commands(group: click.Command, before: str = "") -> Iterator[tuple[str, click.Command]]:
+    if not isinstance(group, click.Group):
+        yield before, group
+        return
+    for name, command in group.commands.items():
+        yield from _commands(command, f"{before}-{name}".strip("-"))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")

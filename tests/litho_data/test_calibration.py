@@ -93,6 +93,16 @@ def test_a_step_is_found_and_measured_within_its_uncertainty():
     assert find_step(grooves, PITCH_UM).height_nm == pytest.approx(300, abs=1e-6)
 
 
+def test_lines_that_vary_together_count_as_fewer() -> None:
+    """By their correlation up to where it first turns negative; here that of the next line alone."""
+    wave = np.cos(np.pi * np.arange(60) / 3)
+    height = np.zeros((60, 80))
+    height[:, 40:] = 0.2 + 0.01 * wave[:, None]
+    found = find_step(height, PITCH_UM)
+    next_line = (wave[1:] * wave[:-1]).sum() / (wave**2).sum()
+    assert (found.line_sd_nm / found.uncertainty_nm) ** 2 == pytest.approx(60 / (1 + 2 * next_line), rel=1e-6)
+
+
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign on a microscope that is off along all three axes, with its gratings and its step."""

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import zarr
 from scipy.ndimage import gaussian_filter
@@ -214,7 +215,10 @@ def test_every_valid_height_has_its_uncertainty(campaign: Path) -> None:
     np.testing.assert_allclose(total, store.quality["sigma_nm"], rtol=1e-9)
     table = replay(campaign / "prints.zarr", ["P11"], arrays=["height_sigma_um"])
     assert table["same_hash"].tolist() == [True]
-    assert (campaign / "prints-report" / "uncertainty.csv").is_file()
+    for name in ("quality", "summary", "uncertainty"):
+        table = pd.read_csv(campaign / "prints-report" / f"{name}.csv", keep_default_na=False, na_values=[])
+        wanted = store.quality[[*table]].fillna("")
+        pd.testing.assert_frame_equal(table, wanted, check_dtype=False, obj=name)
 
 
 def test_a_store_without_uncertainty_opens_and_has_the_same_hash(own_campaign: Path) -> None:

@@ -105,8 +105,8 @@ def test_every_operation_runs_with_its_defaults() -> None:
         np.testing.assert_allclose(levelled.height + levelled.removed, surface(), rtol=0, atol=1e-12)
 
 
-def test_an_empty_recipe_changes_nothing(tmp_path: Path) -> None:
-    levelled, removed = chain(tmp_path, "").apply(surface())
+def test_a_recipe_without_steps_changes_nothing() -> None:
+    levelled, removed = Recipe().apply(surface())
     np.testing.assert_array_equal(levelled, surface())
     np.testing.assert_array_equal(removed, 0.0)
 
@@ -125,6 +125,7 @@ def test_an_empty_recipe_changes_nothing(tmp_path: Path) -> None:
         ("step = 3", "step"),
         ("[[step", "cannot read recipe"),
         ('schema = "other/1"', "schema"),
+        ('name = "a file that was cut"', "no step, wanted at least one"),
     ],
 )
 def test_what_is_no_recipe_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -146,7 +147,7 @@ def test_the_page_says_of_every_operation_whether_another_program_has_levelled_w
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
     follows = {name: row[3] for row in rows if len(row) == 4 for name in re.findall("`([^`]+)`", row[0])}
     assert STEPS.keys() == follows.keys() - {"op"}
-    at = next(i for i, row in enumerate(rows) if row[0] == "has reference fields")
+    at = next(i for i, row in enumerate(rows) if row[0] == "tested with reference fields")
     with_fields, without = (set(re.findall("`([^`]+)`", cell)) for cell in rows[at + 2])
     assert {name for name, whose in follows.items() if whose.startswith("Gwyddion")} <= with_fields | without
     assert not with_fields & without

@@ -289,7 +289,7 @@ def test_axes_at_uneven_steps_are_refused(tmp_path: Path) -> None:
 def test_coordinates_without_a_unit(tmp_path: Path, unit: str, step: float, pitch_um: float | None) -> None:
     """They are µm or in the unit of the heights; where both make a scan, the size has to be given."""
     path = tmp_path / "scan.txt"
-    values = np.random.default_rng(0).random((9, 12))
+    values = 0.05 * np.random.default_rng(0).random((9, 12))
     values[0, 1:], values[1:, 0] = np.arange(11) * step, np.arange(8) * step
     np.savetxt(path, values)
     found = read_scan(path, unit=unit).pitch_um

@@ -8,6 +8,7 @@ import pytest
 from litho_data.foundation.errors import InputError
 from litho_data.register import apply_transform, resample_to_layout, smooth_measured
 from litho_data.register.resample import noise_variance_factor
+from litho_data.register.topography import fill_gaps
 
 SCAN_SHAPE, LAYOUT_SHAPE = (120, 150), (100, 110)
 SCAN_PITCH_UM, LAYOUT_PITCH_UM = (0.1, 0.09), 0.1
@@ -142,6 +143,18 @@ def test_smoothing_across_gaps_is_unbiased_on_a_constant_and_keeps_weights_one()
     height = np.full((40, 40), 0.7)
     height[np.random.default_rng(3).random((40, 40)) < 0.3] = np.nan
     np.testing.assert_allclose(smooth_measured(height, 1.0), 0.7, atol=1e-12)
+
+
+@pytest.mark.parametrize("wide", [2, 3, 4])
+@pytest.mark.parametrize("turns", range(4))
+def test_a_gap_continues_the_plane_of_what_is_measured_beside_it(turns, wide):
+    y, x = np.mgrid[:9, :12]
+    plane = np.rot90(0.02 * y - 0.05 * x, turns)
+    height = plane.copy()
+    height[:-wide] = np.nan
+    # Reflected about its border, as far as the measured strip is wide.
+    filled = slice(-2 * wide + 1, -wide)
+    np.testing.assert_allclose(fill_gaps(height)[filled], plane[filled], atol=1e-12)
 
 
 @pytest.mark.parametrize("matrix", [np.eye(2), np.zeros((3, 3)), np.full((3, 3), np.nan)])

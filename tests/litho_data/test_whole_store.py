@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
@@ -145,6 +146,17 @@ def test_what_can_not_be_is_refused_when_a_store_is_opened(what: str, own_campai
     assert "\n" not in str(refusal.value)
     assert len(str(refusal.value)) < 600
     assert verify(store).findings
+
+
+@pytest.mark.parametrize("part", ["", "height_um"])
+@pytest.mark.parametrize("document", ["[]", "null", '"x"', "1", "{}"])
+def test_a_document_of_another_kind_is_refused(part: str, document: str, own_campaign: Path) -> None:
+    store = own_campaign / "prints.zarr"
+    (store / part / "zarr.json").write_text(document)
+    with pytest.raises(InputError, match=r"metadata|no Zarr v3 group"):
+        open_store(store)
+    with contextlib.suppress(InputError):
+        assert verify(store).findings
 
 
 def test_a_result_records_the_hash_of_what_was_read(own_campaign: Path) -> None:

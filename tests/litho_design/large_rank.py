@@ -11,8 +11,9 @@ import torch.distributed as dist
 
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import load_target
-from litho_design.large.bands import Bands, Ranks
+from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
+from litho_design.optimisation.ranks import Ranks
 from litho_design.printers.printer import Printer
 from litho_design.reports.design import write_design_report
 from litho_design.tasks.run import run_design
@@ -38,8 +39,7 @@ def work(folder: Path, ranks: Ranks) -> None:
     torch.set_num_threads(1)
     bands = Bands(SIZE, BAND, ranks, cell_px=4)
     rows = bands.rows()
-    target = load_target("ring", SIZE)
-    hologram = BandedHologram(settings(), printer(), target, bands)
+    hologram = banded(bands)
     draw = torch.Generator().manual_seed(0)
     level = 12 * torch.rand(SIZE, SIZE, generator=draw)[rows.start : rows.stop]
     field = torch.randn(SIZE, SIZE, dtype=torch.complex64, generator=draw)[rows.start : rows.stop]
@@ -56,10 +56,16 @@ def work(folder: Path, ranks: Ranks) -> None:
     design(folder / "design", bands)
 
 
+def banded(bands: Bands) -> BandedHologram:
+    """The task of this process's bands."""
+    target = load_target("ring", SIZE)
+    given = {"inputs": {"target": target.pixels}, "record": target.record}
+    return BandedHologram(settings(), printer(), bands, **given)
+
+
 def design(folder: Path, bands: Bands) -> None:
     """The hologram of this process's bands."""
-    task = BandedHologram(settings(), printer(), load_target("ring", SIZE), bands)
-    run_design(task, folder, write_design_report, announce=False)
+    run_design(banded(bands), folder, write_design_report, announce=False)
 
 
 def start(rank: int, count: int, port: int, folder: Path) -> None:

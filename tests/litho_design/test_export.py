@@ -21,12 +21,12 @@ from litho_design.exports import marks
 from litho_design.exports.files import export as export_design
 from litho_design.exports.files import import_levels
 from litho_design.exports.gds import rectangles, write_gds
-from litho_design.exports.gwl import Gwl
 from litho_design.exports.image import linear_greys, write_image, write_tiff
+from litho_design.exports.job import Gwl
 from litho_design.exports.sidecar import sidecar_path
 from litho_design.exports.stl import write_stl
 from litho_design.images.targets import load_target
-from litho_design.printers.layout import LayoutSettings, printability
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram
@@ -64,7 +64,7 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
     assert sidecar.nominal_height_um[-1] == pytest.approx(1.2)
     assert sidecar.layout_sha256 == Design.read(design).files["layout_level.npy"]
     raw = json.loads(sidecar_path(file).read_text())
-    assert {"settings", "printability", "stroke", "polarity"} <= raw.keys()
+    assert {"settings", "stroke", "polarity"} <= raw.keys()
     assert np.array_equal(read_layout(file, levels=13), levels)
 
 
@@ -432,7 +432,8 @@ def test_rectangles_cover_once():
 )
 def test_gwl_writes_the_volume_of_the_layout_voxel_by_voxel(tmp_path, design, job, hatching_um):
     """Another parser follows the stage and paints every line into voxels of a pixel and a slice."""
-    file = export_design(design, "gwl", tmp_path / "out", pedestal_um=0.3, hatching_um=hatching_um, gwl=job)
+    asked = {"pedestal_um": 0.3, "hatching_um": hatching_um, "gwl": dict(job)}
+    file = export_design(design, "gwl", tmp_path / "out", **asked)
     levels = np.load(design / "layout_level.npy")
     painted = np.zeros((15, 64, 64))
     stage, points, power, powers, mode = {"X": 0.0, "Y": 0.0}, [], None, {}, None
@@ -466,13 +467,13 @@ def test_gwl_refuses_what_it_cannot_write_exactly(tmp_path, design):
         ("slices of a level", {"slicing_um": 0.15}),
         ("slices of the pedestal", {"pedestal_um": 0.25}),
         ("hatching distances", {"hatching_um": 0.07}),
-        ("laser power", {"gwl": Gwl(power_percent=(50.0, 40.0))}),
+        ("laser power", {"gwl.power_percent": (50.0, 40.0)}),
         ("pedestal_um", {"pedestal_um": 0.0}),
     ):
         with pytest.raises(InputError, match=said):
             export_design(design, "gwl", tmp_path / "out", **more)
     with pytest.raises(InputError, match="piezo mode"):
-        export_design(np.ones((4, 4000), np.uint8), "gwl", tmp_path / "out", gwl=Gwl(mode="piezo"))
+        export_design(np.ones((4, 4000), np.uint8), "gwl", tmp_path / "out", gwl={"mode": "piezo"})
 
 
 def test_dxf_has_a_closed_polyline_on_the_layer_of_its_grey(tmp_path):
@@ -540,28 +541,6 @@ def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "curve.csv")
     with pytest.raises(InputError, match="rising columns"):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "none.csv")
-
-
-def test_printability_of_known_stripes():
-    row = np.repeat([0, 5, 0, 12, 0], [4, 3, 2, 1, 6])
-    levels = np.tile(row, (16, 1)).astype(np.uint8)
-    figures = printability(levels, LayoutSettings(size_px=16))
-    assert figures.smallest_feature_um == pytest.approx(0.1)
-    assert figures.single_pixel_feature_share == pytest.approx(1 / 3)  # inner runs of 3, 2 and 1 pixels
-    assert figures.steepest_step_um == pytest.approx(1.2)
-    assert figures.large_jump_share == pytest.approx(2 * 16 / (2 * 16 * 15))
-    assert figures.used_levels == 3
-
-
-def test_smallest_ring_is_measured_along_the_radius():
-    layout = LayoutSettings(size_px=40, cell_um=0.1, symmetry="radial")
-    # Rings 0-4 (the disc), 5-7, 8-9, 10-27 in levels 3, 0, 5, 1: the narrowest has 2 pixels.
-    ring = np.repeat([3, 0, 5, 1], [5, 3, 2, 20])
-    centre = np.arange(40) - 19.5
-    levels = ring[np.floor(np.hypot(centre[:, None], centre[None, :])).astype(int)].astype(np.uint8)
-    figures = printability(levels, layout)
-    assert figures.smallest_ring_um == pytest.approx(0.2)
-    assert printability(levels, layout.model_copy(update={"symmetry": "none"})).smallest_ring_um is None
 
 
 def test_distance_to_the_training_levels():

@@ -11,48 +11,13 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings
-from litho_design.optimisation.fabrication import Fabrication, fabrication_penalty, outside
+from litho_design.optimisation.fabrication import outside
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.training import out_of_distribution
 from litho_design.reports.advice import distribution_warning, stroke_advice
 from litho_design.tasks.design import LEVELS_FILE
 
 LAYOUT = LayoutSettings(size_px=16, levels=13)
-
-
-def _penalty(rows: np.ndarray, layout: LayoutSettings = LAYOUT, card=None, **settings) -> float:
-    level = torch.as_tensor(np.asarray(rows, np.float32))[None, None]
-    # Steps and features count three times.
-    weight = 1 if "inside_weight" in settings else 3
-    return float(fabrication_penalty(level, Fabrication(**settings), layout, card or {})) / weight
-
-
-def test_steps_above_the_cap_count_by_their_excess():
-    rows = np.tile(np.repeat([2, 9], 8), (16, 1))
-    # One step of 7 in each of 16 rows: 16 of 240 pairs along x, none along y.
-    assert _penalty(rows, max_step_levels=3) == pytest.approx((4 / 12) ** 2 / 15, rel=1e-5)
-    assert _penalty(rows, max_step_levels=7) == 0
-    level = torch.zeros(1, 1, 16, 16)
-    assert fabrication_penalty(level, Fabrication(), LAYOUT, {}) is None
-
-
-def test_ridges_and_grooves_narrower_than_the_smallest_feature_count_by_their_height():
-    row = np.zeros(16)
-    row[5:8] = 6
-    for sign in (1, -1):
-        rows = np.tile(6 + sign * row, (16, 1))
-        # 3 of 16 pixels, half of the range high; along y nothing changes.
-        assert _penalty(rows, min_feature_um=0.4) == pytest.approx(3 / 16 * 6 / 12, rel=1e-5)
-        assert _penalty(rows, min_feature_um=0.3) == 0
-    # A staircase has neither, however narrow its steps; nor has a feature at the border.
-    assert _penalty(np.tile(np.arange(16).clip(max=12), (16, 1)), min_feature_um=0.4) == 0
-    assert _penalty(np.tile(6.0 * (np.arange(16) < 2), (16, 1)), min_feature_um=0.4) == 0
-    # Rings are as wide as along a radius, whatever a row cuts elsewhere.
-    y, x = np.mgrid[:16, :16] - 7.5
-    rings = 6.0 * (np.hypot(y, x) < 4.6)
-    radial = LAYOUT.model_copy(update={"symmetry": "radial", "cell_um": 0.1})
-    assert _penalty(rings, radial, min_feature_um=0.4) == 0
-    assert _penalty(rings, min_feature_um=0.4) > 0
 
 
 def test_tails_beyond_the_training_layouts_pull_inwards():
@@ -113,7 +78,7 @@ def test_a_flagged_design_says_so_and_a_search_that_stays_inside_is_closer(tmp_p
     assert not kept.out_of_distribution.flagged
     assert kept.out_of_distribution.level_distance < gauge.level_distance
     with pytest.raises(InputError, match="other settings"):
-        designed("free", **{"fabrication.min_feature_um": 0.8})
+        designed("free", **{"fabrication.inside_weight": 0.8})
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, first, hologram_settings
 from litho_design.images.targets import load_target, stroke_width_px
+from litho_design.judging.gap import GapResult
+from litho_design.judging.loaded import task_named
 from litho_design.workflows.first import small_hologram
+from tests.tables import require_tables_equal_record
 
 TINY = {
     "layout.size_px": 64,
@@ -30,6 +34,13 @@ def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_pa
         if entry.judge == "pbl":
             assert f"{entry.judged['si_psnr_db']:.3f}" in page
     assert page.count("<img") == 1
+    matrices = {f"matrix_{figure}.csv": figure for figure in task_named("hoe").headline}
+    ends = {"paired.csv": {"95 % from": "", "to": ""}}
+    require_tables_equal_record(tmp_path, GapResult.FILE_NAME, ends, pivoted=[*matrices])
+    for table, figure in matrices.items():
+        shown = pd.read_csv(tmp_path / table).set_index("designed with")
+        for one in (one for one in result.summary if one.figure == figure):
+            assert shown.loc[one.arm, f"printed by {one.judge}"] == pytest.approx(one.judged_mean, abs=6e-4)
     # By the model that took no part, and with a word on chance.
     assert "Printed by physics, layouts designed with" in page
     assert "1 seed cannot tell that from chance" in page

@@ -7,6 +7,7 @@ import sys
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import tifffile
 import torch
@@ -22,6 +23,7 @@ from litho_design.reports.advice import distribution_warning, spread_sentence, s
 from litho_design.tasks.design import Design
 from litho_models import save_frozen, zoo
 from litho_models.models import model_class
+from tests.tables import require_figures_by_column
 
 SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20", "--yield-draws", "5")
 
@@ -163,6 +165,18 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeyp
     assert [one.judge.source for one in result.scores] == [f"{zoo.PREFIX}{one}" for one in others]
     assert all(one.independent for one in result.scores)
     values = [design.predicted["si_psnr_db"], *(one.figures["si_psnr_db"] for one in result.scores)]
+    assert design.thick is not None
+    prints = {"print": design.predicted, "print, thick element": design.thick, **(design.baselines or {})}
+    require_figures_by_column(tmp_path / "design" / "scores.csv", prints)
+    judged = {one.judge.name: one.figures for one in result.scores}
+    by_judge = {"physics (design)": design.predicted, **judged, **(result.baselines or {})}
+    require_figures_by_column(tmp_path / "score" / "scores.csv", by_judge)
+    heights = pd.read_csv(tmp_path / "score" / "heights.csv").set_index("printed by")
+    for one in result.scores:
+        assert one.mean_height_difference_um is not None
+        assert one.rms_height_difference_um is not None
+        stated_nm = [1000 * one.mean_height_difference_um, 1000 * one.rms_height_difference_um]
+        assert heights.loc[one.judge.name].tolist() == pytest.approx(stated_nm)
     page = (tmp_path / "score" / "report.html").read_text("utf-8")
     assert f"{np.median(values):.3g} in the median, {min(values):.3g} at worst" in page
     said = spread_sentence("si_psnr_db", {"own": 20.0, "other": 18.0, "third": 18.5}, False, 1.5)

@@ -15,7 +15,7 @@ from litho_design.exports.files import export, import_levels
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import load_design
-from litho_design.large.bands import Bands, Ranks
+from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
 from litho_design.large.lens import RingLens
 from litho_design.large.propagator import BandedPropagator
@@ -23,8 +23,8 @@ from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, centred_grid, make_propagator
 from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.ranks import Ranks
 from litho_design.optimisation.search import search_layout
-from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, RING_HEIGHT_FILE, RINGS_FILE, Design
 from litho_design.workflows.design import design_lens
@@ -71,7 +71,7 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
     found = []
     for task in (
         HologramTask(settings, printer, inputs={"target": target.pixels}),
-        BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4)),
+        BandedHologram(settings, printer, Bands(SIZE, BAND, cell_px=4), inputs={"target": target.pixels}),
     ):
         loss, _ = task.objective(level)
         found.append((loss.detach(), torch.autograd.grad(loss, level)[0]))
@@ -154,39 +154,19 @@ def test_a_score_in_bands_is_that_of_the_whole(alone, tmp_path):
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
 
-def test_displaced_write_fields_are_judged_alike_in_one_piece_and_in_bands(alone, tmp_path):
-    design, printer, stitch = alone / "design", large_rank.printer(), Stitching(field_um=4.0, sigma_um=0.15)
-    loaded = load_design(design)
-    plain = loaded.printed_um(printer)
-    moved = in_fields(plain, 0.1, 40, stitch.offsets_um(SIZE, 0.1, [0]))
-    wanted = loaded.score(moved).model_dump()
-    folders = (tmp_path / "bands", tmp_path / "whole")
-    (streamed,) = score(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
-    for name, value in streamed.figures.items():
-        # As without fields: rounding of waves, in figures that are sums of squares of them.
-        assert value == pytest.approx(wanted[name], rel=1e-4, abs=1e-7), name
-    assert streamed.rms_height_difference_um == pytest.approx(float((moved - plain).square().mean().sqrt()))
-    (judged,) = score(design, folders[1], judges=[printer], stitch=stitch).scores
-    assert judged.figures["eff_signal"] < loaded.score(plain).eff_signal
-    for name, value in streamed.figures.items():
-        # One draw of eight lies within 7 / sqrt(8) = 2.5 standard deviations of their mean, by algebra.
-        assert abs(value - judged.figures[name]) <= 2.5 * judged.uncertainty[name] + 1e-6, name
-    assert judged.stitching == streamed.stitching == stitch
-    assert "write fields of 4 µm lie off their places by 0.15 µm" in (folders[1] / "report.html").read_text()
-
-
 def test_what_a_large_element_cannot_have_is_refused():
-    settings, printer, target = large_rank.settings(), large_rank.printer(), load_target("ring", SIZE)
+    settings, printer, wide = large_rank.settings(), large_rank.printer(), Bands(SIZE, BAND, cell_px=4)
+    inputs = {"target": load_target("ring", SIZE).pixels}
     with pytest.raises(InputError, match="at most one per band"):
         Bands(SIZE, 64, Ranks(0, 4))
     with pytest.raises(InputError, match="rows of a band"):
-        BandedHologram(settings, printer, target, Bands(SIZE, 12, cell_px=4))
+        BandedHologram(settings, printer, Bands(SIZE, 12, cell_px=4), inputs=inputs)
     thick = settings.model_copy(update={"optics": settings.optics.model_copy(update={"element": "thick"})})
     with pytest.raises(InputError, match=r"optics\.element of a large element"):
-        BandedHologram(thick, printer, target, Bands(SIZE, BAND, cell_px=4))
+        BandedHologram(thick, printer, wide, inputs=inputs)
     printer.simulator.reach_um = None
     with pytest.raises(InputError, match="depends on the whole image"):
-        BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4))
+        BandedHologram(settings, printer, wide, inputs=inputs)
 
 
 def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
@@ -201,9 +181,9 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     plane, rings = lens_task(settings, printer), RingLens(settings, printer, 48)
     free = 12 * torch.rand(plane.cells.cells, generator=torch.Generator().manual_seed(0))
     radius = rings.cells(free[: rings.cells.cells[0]])[None, None]
-    printed = rings.search_print(radius, 0)
+    printed = rings.search_print(radius, printer)
     # Beyond the aperture the plane has corners, which the print reaches for 8 px: 1e-5 µm is rounding.
-    assert (printed - plane.printed_rings(plane.cells(free)[None, None]))[:-8].abs().max() < 1e-5
+    assert (printed - plane.printed_rings(plane.cells(free)[None, None], printer))[:-8].abs().max() < 1e-5
     found, whole = (
         (one.objective(two)[0], one.score(one.bench.ideal_height_um()))
         for one, two in ((rings, radius), (plane, plane.cells(free)[None, None]))
@@ -235,8 +215,8 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     changed = settings.model_copy(update={"search": settings.search.model_copy(update={"iterations": 7})})
     with pytest.raises(InputError, match=r"other settings, search\.iterations"):
         design_lens(printer, tmp_path, settings=changed, tile_px=48, announce=False)
-    with pytest.raises(InputError, match="got write fields or bands"):
-        score(tmp_path, tmp_path / "fields", judges=[printer], stitch=Stitching(sigma_um=0.1))
+    with pytest.raises(InputError, match="score of a lens in rings, got bands"):
+        score(tmp_path, tmp_path / "bands", judges=[printer], band_px=64)
     (tmp_path / RINGS_FILE).write_bytes(b"")
     with pytest.raises(InputError, match="a file changed after the design"):
         export(tmp_path, "tiff", tmp_path / "again")

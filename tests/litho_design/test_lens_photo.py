@@ -14,11 +14,10 @@ from scipy.ndimage import map_coordinates
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
-from litho_design.images.photograph import PhotoSource
+from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.similarity import matched_scale, similarity
 from litho_design.images.targets import TargetRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredSource
 from litho_design.judging.photographs import score_lens_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.lenses.bench import sensor_psf

@@ -12,12 +12,13 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
+from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import freed_of_noise
-from litho_design.images.photograph import PhotoSource, _saturated
+from litho_design.images.photograph import _saturated
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredSource, _without_tip, fitted_background
+from litho_design.judging.measured import _without_tip, fitted_background
 from litho_design.judging.photographs import score_hologram_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer

@@ -145,7 +145,7 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
     def design(place, objects):
         design_lens(printer, tmp_path / place, settings=settings, objects=objects, announce=False)
 
-    def stop(self, height_um):
+    def stop(self, level, height_um):
         raise KeyboardInterrupt
 
     design("done", [folder])

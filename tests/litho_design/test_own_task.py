@@ -128,7 +128,7 @@ def test_robust_and_ensemble_losses_serve_an_own_task(tmp_path, make_printer):
     made = design(
         Corner, printers[0], tmp_path, settings=settings, judges=printers[1:], robust=True, announce=False
     )
-    assert made.ensemble.disagreement_nm > 0
+    assert made.width.searched_with == 2
     task = Corner(settings, printers[0], ensemble=printers[1:])
     level = torch.from_numpy(load_design(tmp_path).level.numpy())[None, None].float()
     assert float(task.objective(level)[0]) == pytest.approx(made.polished_loss, rel=1e-4)

@@ -18,7 +18,6 @@ from litho_design.optimisation.process_window import (
     measure_yield,
     measured_window,
 )
-from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -123,69 +122,3 @@ def test_gain_and_offset_are_drawn_together():
     measured = np.corrcoef([d.gain for d in many], [d.offset_um for d in many])[0, 1]
     # Standard error of a correlation: (1 - r^2) / sqrt(n) = 0.006.
     assert measured == pytest.approx(-0.8, abs=0.03)
-
-
-def _first_order(height_um: torch.Tensor, period_px: int) -> complex:
-    """Amplitude of the first order behind rows of a weak grating, which is that of its heights."""
-    wave = torch.exp(-2j * torch.pi * torch.arange(height_um.shape[1]).double() / period_px)
-    return complex((height_um.double() * wave).mean())
-
-
-def test_a_displaced_field_turns_its_first_order_by_the_displacement_over_the_period():
-    # Two fields of 80 px; a grating of 16 px; the second is moved by 3 px along x and by 5 along y.
-    grating = torch.cos(2 * torch.pi * torch.arange(160).double() / 16).repeat(160, 1)
-    offsets_um = np.zeros((2, 2, 2))
-    offsets_um[0, 1] = (0.5, 0.3)
-    moved = in_fields(grating, 0.1, 80, offsets_um)
-    # Four whole periods well within each field, which begin at the same phase.
-    inside = slice(10, 70)
-    plain, turned = (_first_order(moved[inside, left : left + 64], 16) for left in (8, 88))
-    assert np.angle(turned / plain) == pytest.approx(-2 * np.pi * 3 / 16)
-    assert abs(turned) == pytest.approx(abs(plain))
-    # Fields that stay are as they were, and so is a print all of whose fields stay.
-    assert torch.equal(moved[80:, :80], grating[80:, :80])
-    assert torch.equal(in_fields(grating, 0.1, 80, np.zeros((2, 2, 2))), grating)
-    # Between pixels a wave of k = 2 pi / 16 per px lies along chords: at 1/4 px its phase is off by k^3 / 64.
-    offsets_um[0, 1] = (0.0, 0.025)
-    turned = _first_order(in_fields(grating, 0.1, 80, offsets_um)[inside, 88:152], 16)
-    assert np.angle(turned / plain) == pytest.approx(-2 * np.pi * 0.25 / 16, abs=(2 * np.pi / 16) ** 3 / 60)
-
-
-def test_seams_are_bare_where_fields_part_and_no_taller_where_they_overlap():
-    plate = torch.full((40, 60), 0.8, dtype=torch.float64, requires_grad=True)
-    offsets_um = np.zeros((2, 3, 2))
-    offsets_um[:, 0, 1], offsets_um[:, 2, 1] = -0.15, -0.4
-    moved = in_fields(plate, 0.1, 20, offsets_um)
-    # The first field is 1.5 px to the left of its place: a gap of as much, and what left the element is lost.
-    gap = 0.8 * torch.tensor([1.0, 0.5, 0.0, 1.0])
-    assert moved[7, 17:21].tolist() == pytest.approx(gap.tolist())
-    # The last covers 4 px of the middle one, and leaves as many bare at the rim.
-    assert moved[7, 20:56].tolist() == pytest.approx([0.8] * 36)
-    assert moved[:, 56:].abs().max() == 0
-    # The gradient of each height is the share of it that is left: nothing of the first column and a half.
-    moved.sum().backward()
-    assert plate.grad[7, :4].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
-    assert plate.grad[7, 36:44].tolist() == pytest.approx([0.5] * 8)
-
-
-def test_displaced_fields_lose_of_an_order_what_their_spread_says_and_other_draws_stay():
-    # N fields with phases of sd s: the intensity on the axis is exp(-s²) + (1 - exp(-s²)) / N of the whole.
-    stitch = Stitching(field_um=6.4, sigma_um=0.2)
-    window = ProcessWindow(gain_sd=0.0, offset_sd_um=0.0, blur_sd_um=0.0, stitch=stitch)
-    grating = torch.cos(2 * torch.pi * torch.arange(512).double() / 16).repeat(512, 1)
-    whole = abs(_first_order(grating, 16)) ** 2
-    found = []
-    for draw in draws(window, Optics(), 4):
-        offsets_um = stitch.offsets_um(512, 0.1, list(draw.stitch_seed))
-        phases = np.exp(-2j * np.pi * offsets_um[..., 1] / 1.6)
-        seen = abs(_first_order(draw.apply(grating, 0.1), 16)) ** 2 / whole
-        # Neighbours are 2.8 px (sd) apart: 1.1 px in 64 are bare on average, along both axes, and chords
-        # between pixels take k² / 12 = 0.013 of the amplitude: 0.91 of the power is left, by draw.
-        assert seen == pytest.approx(0.91 * abs(phases.mean()) ** 2, rel=0.05)
-        found.append(abs(phases.mean()) ** 2)
-    spread = np.exp(-((2 * np.pi * 0.2 / 1.6) ** 2))
-    # 64 fields each: the mean phase has an sd of 0.8 / 8, its square 0.2 of the whole, over four draws 0.1.
-    assert np.mean(found) == pytest.approx(spread + (1 - spread) / 64, rel=0.3)
-    assert [draw.gain for draw in draws(ProcessWindow(stitch=stitch), Optics(), 3)] == [
-        draw.gain for draw in draws(ProcessWindow(), Optics(), 3)
-    ]

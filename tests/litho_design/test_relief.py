@@ -14,7 +14,8 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design import correct, load_design
 from litho_design.cli.app import main
-from litho_design.judging.measured import MeasuredSource, measured_print
+from litho_design.images.measurements import MeasuredSource
+from litho_design.judging.measured import measured_print
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief

@@ -10,7 +10,7 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings, load_design
 from litho_design.holograms.bench import HologramBench
-from litho_design.large.hologram import ONLY, only
+from litho_design.large.hologram import LIGHT, only
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.settings import LensView
 from litho_design.optics import Optics, element_field, intensity_share
@@ -101,7 +101,7 @@ def test_a_source_is_refused_where_one_plane_wave_is_computed():
     with pytest.raises(InputError, match="source of a lens"):
         LensBench(LAYOUT, wide, LensView(window_px=64))
     with pytest.raises(InputError, match=r"source_sine of a large element"):
-        only(hologram_settings(changes={"optics.source_sine": 0.02}), ONLY)
+        only(hologram_settings(changes={"optics.source_sine": 0.02}), LIGHT)
     with pytest.raises(InputError, match="width of the source"):
         coherent_parts(OPTICS.model_copy(update={"source_sine": 0.5}), 100.0)
     with pytest.raises(InputError, match="bandwidth of the source"):

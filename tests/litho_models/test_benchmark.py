@@ -23,7 +23,6 @@ from litho_models.evaluation.fit_cache import expected, fit_or_load
 from litho_models.evaluation.results import Benchmark, Evaluation, compare
 from litho_models.fitting.runs import TrainingRun, train, training_config
 from litho_models.frozen.freezing import freeze
-from litho_models.scan_terms import NuisanceProtocol
 from litho_models.splits.folds import plan_folds
 from tests.litho_models.prints import make_scans, write_store
 from tests.tables import require_tables_equal_record
@@ -108,9 +107,9 @@ def test_the_report_shows_the_result_in_words_tables_and_pictures(result):
     )
     assert all(f">{scan_id}<" in page for scan_id in [*record.split.scored_ids, *MODELS])
     assert all(f">{scores.mae_abs_nm:.2f}<" in page for scores in record.scores)
-    # Errors, one scan as maps and as a profile, gains of prints, levels, frequencies.
+    # Errors, one scan as maps and as a profile, levels, frequencies.
     # tests/test_reports.py looks at such in a browser.
-    assert page.count("data:image/svg+xml;base64,") == 6
+    assert page.count("data:image/svg+xml;base64,") == 5
 
 
 def test_over_fitting_shows_because_three_errors_are_alike(result):
@@ -364,25 +363,6 @@ def test_a_model_of_another_geometry_is_refused(store, tmp_path):
     with pytest.raises(InputError, match="pitch_um"):
         evaluate(tmp_path / "run" / "model", other, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_line_offsets_are_attributed_to_their_frame():
-    from litho_models.scoring.records import Prediction
-    from litho_models.scoring.scores import score_model
-
-    scans = make_scans(1, size_px=256, noise_um=0.005)
-    angle = np.deg2rad(1.0)
-    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    stripes = np.random.default_rng(0).normal(0, 0.01, 256)[:, None].astype(np.float32)
-    from tests.litho_models.prints import printed_height_um
-
-    scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
-    truth = printed_height_um(scan.layout_um).astype(np.float32)
-    scores = score_model("truth", [scan], [Prediction(truth)], NuisanceProtocol.of_policy("offset"))
-    # Stripes of 10 nm along the layout's rows; along scan lines turned by 1° they average out over
-    # 57 px, of which 256 px hold 4.5: a half to a third is left.
-    assert scores.row_offset_sd_nm == pytest.approx(10, abs=1.5)
-    assert scores.scan_line_offset_sd_nm < 0.7 * scores.row_offset_sd_nm
 
 
 def test_the_commands(store, tmp_path):

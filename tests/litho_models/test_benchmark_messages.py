@@ -25,6 +25,27 @@ def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tm
     assert "…" not in result.stdout
 
 
+def test_a_result_without_end_is_refused_before_it_is_read():
+    with pytest.raises(InputError, match="a pipe or a device"):
+        litho_models.compare("/dev/zero", "/dev/zero")
+
+
+@pytest.mark.parametrize(("workers", "covered"), [(1, 0), (2, 4)])
+def test_one_estimate_covers_all_fits_where_workers_share_them(
+    workers, covered, store, tmp_path, monkeypatch
+):
+    asked = []
+
+    def seen(done, what, total, *, estimate_of, at_once):
+        asked.append((total, estimate_of, at_once))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("litho_models.evaluation.benchmark.progress", seen)
+    with pytest.raises(KeyboardInterrupt):
+        litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2, workers=workers)
+    assert asked == [(4, covered, workers)]
+
+
 def test_a_benchmark_is_extended_but_not_replaced_by_another(store, tmp_path):
     litho_models.benchmark(store, tmp_path, models=["identity"], folds=2)
     litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2)

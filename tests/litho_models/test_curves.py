@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from litho_models.scoring.transfer import half_power_frequency, transfer_curves
+from litho_models.scoring.transfer import transfer_curves
 from tests.litho_models.prints import make_scan
 
 PITCH_UM = 0.1
@@ -35,26 +35,20 @@ def test_white_error_has_a_flat_density_whose_integral_is_its_variance():
         assert np.sum(density) * width == pytest.approx(100, rel=0.03)
 
 
-def test_a_blurred_prediction_falls_to_half_power_where_the_gaussian_does():
+def test_a_blurred_prediction_follows_as_far_as_the_gaussian_does():
     height = white(2, 0.2)
     sigma_um = 0.15
     curves = transfer_curves([scan_of(height)], [gaussian_filter1d(height, sigma_um / PITCH_UM, axis=1)])
-    # exp(-2 π² σ² f²) = 1/√2; along y nothing is blurred.
-    assert curves.half_power_x_per_um == pytest.approx(
-        np.sqrt(np.log(2) / 2) / (np.sqrt(2) * np.pi * sigma_um), rel=0.02
-    )
-    assert curves.half_power_y_per_um is None
-    # The integral of the squared Gaussian is 1/(4 σ √π).
-    assert curves.noise_band_x_per_um == pytest.approx(1 / (4 * sigma_um * np.sqrt(np.pi)), rel=0.02)
+    frequency = np.array(curves.frequency_per_um)
+    # A band is 0.2 cycles/µm wide; over it the Gaussian changes by 0.06 at most.
+    assert curves.gain_x == pytest.approx(np.exp(-2 * (np.pi * sigma_um * frequency) ** 2), abs=0.02)
+    # Lines along y are blurred across, each frequency alike.
+    assert np.ptp(curves.gain_y[1:]) < 0.05
 
 
 def test_a_perfect_prediction_follows_to_the_end():
     height = white(3, 0.2, 64)
     curves = transfer_curves([scan_of(height)], [height])
-    assert curves.half_power_x_per_um is None
-    assert curves.noise_band_x_per_um == pytest.approx(0.5 / PITCH_UM)
+    assert curves.gain_x == pytest.approx([1] * len(curves.gain_x))
+    assert curves.coherence_y == pytest.approx([1] * len(curves.gain_x))
     assert np.max(curves.error_psd_x) == 0
-
-
-def test_half_power_lies_between_the_bands_that_enclose_it():
-    assert half_power_frequency(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == pytest.approx(2 - np.sqrt(0.5))

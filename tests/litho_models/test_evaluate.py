@@ -17,6 +17,7 @@ from litho_models.evaluation.results import Evaluation
 from litho_models.fitting.runs import train
 from litho_models.noise.residuals import read_residuals
 from tests.litho_models.prints import make_scans, write_store
+from tests.tables import require_tables_equal_record
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +35,10 @@ def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_pat
     scored = evaluate(folder / "model", store, tmp_path / "out")
     assert set(run.training_ids) & set(scored.split.scored_ids)
     assert scored.trained_on_scored_scans == (sorted(run.training_ids) if same else [])
+    above = {"headline.csv": {"above_floor_nm": ""}}
+    require_tables_equal_record(tmp_path / "out", Evaluation.FILE_NAME, above, pivoted=["policies.csv"])
     assert ("not a held-out error" in (tmp_path / "out" / "report.html").read_text()) == same
-    assert read_residuals(open_store(store), [folder / "model"]).held_out == (not same)
+    assert read_residuals(open_store(store), folder / "model").held_out == (not same)
 
 
 def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):

@@ -57,7 +57,7 @@ def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> No
     assert export_model(model, tmp_path / "model.pt2", SIZE_PX) <= LARGEST_DIFFERENCE_UM
     facts = {"card.json": ""}
     program = torch.export.load(tmp_path / "model.pt2", extra_files=facts).module()
-    # A layout that the export has not seen, and the model by its usual way, compiled stack included.
+    # A layout that the export has not seen.
     torch.testing.assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
     assert json.loads(facts["card.json"])["pitch_um"] == model.pitch_um
 

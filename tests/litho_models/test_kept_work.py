@@ -164,11 +164,11 @@ def test_a_damaged_fit_is_told_where_the_noise_reads_it_too(scored, store, tmp_p
 
     out = tmp_path / "out"
     shutil.copytree(scored[1], out)
-    assert read_residuals(open_store(store), [out], "affine").held_out
+    assert read_residuals(open_store(store), out, "affine").held_out
     folder = next(path for path in (out / "cache").glob("affine-*"))
     (folder / "prediction_000.npy").unlink()
     with pytest.raises(InputError, match=f"delete {folder} and run again"):
-        read_residuals(open_store(store), [out], "affine")
+        read_residuals(open_store(store), out, "affine")
 
 
 def test_a_result_lists_the_settings_that_a_fit_used(scored):

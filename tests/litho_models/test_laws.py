@@ -87,7 +87,13 @@ def along(h: np.ndarray, direction: str, length_um: float) -> np.ndarray:
 Y, X = (np.linspace(-1, 1, n) for n in SHAPE)
 PLACES = {"x": X[None, :] + 0 * Y[:, None], "y": Y[:, None] + 0 * X[None, :]}
 PLACES["r2"] = PLACES["x"] ** 2 + PLACES["y"] ** 2
+EDGE_PX = np.minimum(
+    *np.meshgrid(*(np.minimum(np.arange(n), np.arange(n)[::-1]) for n in SHAPE), indexing="ij")
+)
+PLACES["rim"] = np.exp(-EDGE_PX * PITCH_UM / 2.0)
 ORDER = 0.3
+# A jump at the middle, between two pixels or on one, which then is half on either side.
+JUMPS = {axis: np.clip(PLACES[axis] * (n - 1) / 2 + 0.5, 0, 1) for axis, n in zip("yx", SHAPE, strict=True)}
 SIDES = ("left", "right", "above", "below")
 
 
@@ -112,11 +118,17 @@ def formulas() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
         found[f"height-power-{power}"] = lambda h, p=power: h**p
     for place, own in PLACES.items():
         found[f"height-times-{place}"] = lambda h, p=own: h * p
+        found[f"blur-{place}-1-5-um"] = lambda h, p=own: (mean_within(h, 1.5) - h) * p
+    for axis, at in JUMPS.items():
+        found[f"jump-along-{axis}-in-height"] = lambda h, p=at: p
+        found[f"jump-along-{axis}-in-gain"] = lambda h, p=at: h * p
+        for way in ("x", "y"):
+            found[f"jump-along-{axis}-in-{way}"] = lambda h, p=at, w=way: slope(h, w) * p
     found["height-squared-times-order"] = lambda h: h**2 * ORDER
     for reach in (0.6, 1.5, 4.0):
         end = f"{reach:g}-um".replace(".", "-")
         found[f"surroundings-{end}"] = lambda h, r=reach: mean_within(h, r) - h
-        found[f"height-times-surroundings-{end}"] = lambda h, r=reach: h * mean_within(h, r)
+        found[f"blur-height-{end}"] = lambda h, r=reach: h * (mean_within(h, r) - h)
         found[f"above-surroundings-{end}"] = lambda h, r=reach: (h - mean_within(h, r)) ** 2
         found[f"steps-within-{end}"] = lambda h, r=reach: mean_within(
             np.hypot(slope(h, "x"), slope(h, "y")), r
@@ -146,7 +158,7 @@ def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
     # Besides the rounding, which a place may double: a Gaussian ends after 4 sigma, a tail after 6 lengths,
     # or a field, with what comes around from the other side.
     allowed = 2 * ROUNDED
-    if name.split("-")[0] in (*SIDES, "along") and "surroundings" not in name:
+    if name.split("-")[0] in (*SIDES, "along"):
         steps = float(".".join(part for part in name.split("-") if part.isdigit())) / PITCH_UM
         allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
     found = changed(name, {"strength": 0.05}, HEIGHT)
@@ -174,7 +186,7 @@ def test_a_flat_print_has_a_finite_derivative(name: str) -> None:
 POWERS_OF_UM = {"1": 0, "µm": 1, "µm²": 2, "1/µm": -1, "1/µm²": -2}
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if not name.endswith("-um")])
+@pytest.mark.parametrize("name", [name for name in LAWS if not name.endswith(("-um", "-rim"))])
 def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
     """In units half as large all lengths are twice as many, the change of the height too."""
     unit = LAWS[name].parameters["strength"].unit

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop import checking, results
+from litho_models.loop import checking, closing, results
 from litho_models.loop.checking import FORM_SHARE, Check, reshaped_gain
+from litho_models.loop.closing import Closed
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.judging import judge
-from litho_models.loop.search import Cause
+from litho_models.loop.search import Cause, Found
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
@@ -65,9 +67,9 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
     ("reshaped_nm2", "left_nm2", "exhausted", "said"),
     [
         (1.4, 0.0, [], ""),  # 14 % of its gain in other shapes
-        (1.6, 5.0, [], "takes 16 % of its gain"),
+        (1.6, 5.0, [], "gain another 16 %"),
         (1.6, 5.4, [], ""),  # more than twice as much again is left for causes that are missing
-        (1.6, 5.4, ["fraction"], "more of it than there can be: fraction"),
+        (1.6, 5.4, ["fraction"], "beyond the largest possible one: fraction"),
         (1.4, 0.0, ["fraction"], ""),
     ],
 )
@@ -136,17 +138,48 @@ def test_a_name_falls_if_a_table_takes_twice_as_much_in_its_place_and_leaves_it_
     assert bool(reason) is falls
 
 
+def with_base(own: int, effects: int = 0, mse_nm2: float = 100.0) -> SimpleNamespace:
+    """A model whose base has so many numbers, its effects so many more."""
+    return SimpleNamespace(twin=SimpleNamespace(own=own, vector=np.zeros(own + effects)), mse_nm2=mse_nm2)
+
+
 @pytest.mark.parametrize(
-    ("survives_on", "knowledge", "verdict"),
-    [(["affine-mtf", "blur-table"], "cause", "explained"), (["blur-table"], "description", "described")],
+    ("found_on", "knowledge"),
+    [
+        (["affine-mtf", "blur-table"], "cause"),
+        (["affine-mtf"], "cause"),
+        (["blur-table"], "description"),
+    ],
 )
-def test_a_cause_that_another_base_does_not_need_is_described(
-    survives_on: list[str], knowledge: str, verdict: str, monkeypatch: pytest.MonkeyPatch
+def test_a_cause_that_a_base_as_small_does_not_need_is_described(
+    found_on: list[str], knowledge: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A base with more numbers than the one that was taken may have the cause in them."""
     monkeypatch.setattr(results, "_strengths", lambda closed, name: {})
-    closed = SimpleNamespace(others={"affine-mtf": None, "blur-table": None})
-    found = results._found(closed, gaining("dose-exponent", 10), 0.1, survives_on)
-    assert (found.knowledge, found.verdict) == (knowledge, verdict)
+    cause = gaining("dose-exponent", 10)
+    rivals = {
+        name: Found(with_base(own), [replace(cause, name="hatch-ripple", alike=("dose-exponent",))])
+        if name in found_on
+        else Found(with_base(own), [gaining("slope-thinning", 10)])
+        for name, own in {"affine-mtf": 7, "blur-table": 14}.items()
+    }
+    others = dict.fromkeys(("base", "named", "lawful", "described", "rests", "untestable"))
+    closed = Closed(base_name="physics", rivals=rivals, plain=with_base(7), **others)
+    found = results._found(closed, cause, 0.1)
+    assert (found.knowledge, found.survives_on) == (knowledge, found_on)
+
+
+@pytest.mark.parametrize(("better_nm2", "chosen"), [(98.1, "physics"), (97.9, "blur-table")])
+def test_the_base_with_the_fewest_numbers_is_taken_if_none_is_better_by_two_percent(
+    better_nm2: float, chosen: str
+) -> None:
+    """Causes count: one that another base does not need is the price of this one."""
+    found = {
+        "affine-mtf": Found(with_base(7, 9)),
+        "blur-table": Found(with_base(14, 1, better_nm2)),
+        "physics": Found(with_base(7, 5)),
+    }
+    assert closing._simplest(found) == chosen
 
 
 @pytest.mark.parametrize(

@@ -316,18 +316,19 @@ def test_folds_hold_every_scan_out_once() -> None:
     assert np.array_equal(study.fold_of, Study.dealt(scans, 5).fold_of)
 
 
-def test_a_base_is_asked_for_by_name_or_the_best_is_taken(
+def test_a_base_is_asked_for_by_name_or_the_smallest_of_those_that_do_as_well_is_taken(
     quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = study_of(planted(count=4))
 
     def chosen(base: str) -> tuple[str, list[str]]:
         closed = close(study, bases.bases_for(base, study, cache=tmp_path))
-        return closed.base_name, [*closed.others]
+        return closed.base_name, [*closed.rivals]
 
     assert chosen("affine") == ("affine", [])
-    monkeypatch.setattr(bases, "_COMPETING", ("identity", "affine"))
-    assert chosen(bases.AUTO) == ("affine", ["identity"])
+    # A gain and a datum are what every scan may add by itself.
+    monkeypatch.setattr(bases, "_COMPETING", ("affine", "identity"))
+    assert chosen(bases.AUTO) == ("identity", ["affine"])
     with pytest.raises(InputError):
         chosen("nonsense")
 

@@ -70,7 +70,7 @@ def test_scars_are_told_from_marks_across_the_lines(along: bool, turned: bool) -
         scans = [replace(scan, scan_to_layout=TURNED) for scan in scans]
     one = found_in(with_heights(scans, [grain] * 10))["scars-and-spikes"]
     assert one.seen is along
-    assert ("30 outliers drawn out along the lines and 0 across" in one.evidence) is along
+    assert ("30 outliers elongated along the lines and 0 across" in one.evidence) is along
 
 
 def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_lines() -> None:

@@ -48,13 +48,13 @@ def test_gain_and_offset_of_a_known_line():
     x = np.linspace(0, 1.2, VALID.size).reshape(VALID.shape)
     line = print_gain(0.7 * x + 0.05, x, VALID)
     assert (line.slope, line.intercept_nm) == (pytest.approx(0.7), pytest.approx(50))
-    assert max(line.slope_error, line.intercept_error_nm / 1000) < 1e-12
+    assert line.slope_error < 1e-12
     flat = print_gain(x, np.ones(VALID.shape), VALID)
-    assert np.isnan(flat.slope)
+    assert (flat.slope, flat.slope_error) == (None, None)
     assert flat.intercept_nm == pytest.approx(600)
 
 
-def test_the_covariance_of_gain_and_offset_is_that_of_repeated_prints():
+def test_the_error_of_the_gain_is_that_of_repeated_prints():
     random = np.random.default_rng(3)
     prediction = 0.6 + 0.2 * gaussian_filter(random.normal(size=VALID.shape), 4) * 14
     found = []
@@ -62,15 +62,10 @@ def test_the_covariance_of_gain_and_offset_is_that_of_repeated_prints():
         # Correlated over 7 px, as the residual of measured prints is, and rougher where it is high.
         noise = 0.1 * gaussian_filter(random.normal(size=VALID.shape), 3) * (0.5 + prediction)
         found.append(print_gain(0.9 * prediction + 0.03 + noise, prediction, VALID))
-    slopes, offsets = (
-        np.array([getattr(line, name) for line in found]) for name in ("slope", "intercept_nm")
-    )
+    slopes = np.array([line.slope for line in found])
     # 300 repeats know a standard deviation to 4 %; 64 blocks know theirs to 9 % each time, and lose a few
     # per cent of it to what neighbouring blocks share.
     assert np.mean([line.slope_error for line in found]) == pytest.approx(slopes.std(), rel=0.15)
-    assert np.mean([line.intercept_error_nm for line in found]) == pytest.approx(offsets.std(), rel=0.15)
-    correlations = [line.slope_intercept_correlation for line in found]
-    assert np.mean(correlations) == pytest.approx(np.corrcoef(slopes, offsets)[0, 1], abs=0.1)
     # Taken for independent, the same pixels would promise several times too much.
     naive = noise.std() / (prediction.std() * np.sqrt(VALID.size))
     assert slopes.std() > 3 * naive

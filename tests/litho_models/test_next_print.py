@@ -352,6 +352,8 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     assert NextPrint.read(tmp_path / "plan") == plan
     middle = {"questions.csv": {"power": "", "random_power": ""}}
     require_tables_equal_record(tmp_path / "plan", NextPrint.FILE_NAME, middle)
+    # The long table is folded away.
+    assert '<summary class="section">Scans<' in (tmp_path / "plan" / "report.html").read_text("utf-8")
     with pytest.raises(InputError, match=r"seed = 0, but now 99 is asked for"):
         next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
-from inspect import signature
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.signal import lfilter
 from scipy.stats import norm
 from scipy.stats import t as student
 
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
-from litho_models.cli.noise import noise
-from litho_models.noise.analyse import analyse_noise_of_files
 from litho_models.noise.budget import noise_budget
-from litho_models.noise.calibration import Stated, _bins, analyse_spread, calibrate, conformal_factor
+from litho_models.noise.calibration import Stated, _bins, analyse_spread, calibrate
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import repeated_prints
-from litho_models.noise.residuals import Residuals, disagreement_um
+from litho_models.noise.residuals import Residuals
 from litho_models.noise.spread_scores import (
     GAUSSIAN,
     Tails,
@@ -141,7 +137,7 @@ def test_planted_roughness_comes_back_in_quadrature(correlation_px):
     flat = rough((256, 256), 0.0159, 2, correlation_px) + rough((256, 256), 0.00125, 3) + 0.6
     below = surface_noise("substrate", substrate, "offset")
     above = surface_noise("flat", flat, "offset")
-    found = print_noise(above, below)
+    found = print_noise(above, [below])
     # Fields are scaled to their sample sd; what is left is chance correlation of the two, 1/√n_eff.
     chance = 2 * 15.9 * 1.25 / np.sqrt(above.independent_heights) / 15.9
     assert found.print_nm == pytest.approx(15.9, abs=3 * chance + 1e-6)
@@ -178,7 +174,7 @@ def test_a_bow_is_roughness_for_one_background_and_not_for_the_other():
 def test_a_print_smoother_than_its_substrate_has_no_roughness_of_its_own():
     found = print_noise(
         surface_noise("flat", rough((64, 64), 0.001), "offset"),
-        surface_noise("substrate", rough((64, 64), 0.002), "offset"),
+        [surface_noise("substrate", rough((64, 64), 0.002), "offset")],
     )
     assert found.print_nm is None
 
@@ -217,14 +213,11 @@ def test_step_heights_readability_and_misreading_follow_from_the_noise():
     assert len(found.steps) == 4
     assert found.tread_sigma_nm == pytest.approx(16, rel=0.02)
     assert found.resolvable_step_nm == pytest.approx(2 * GAUSSIAN.half_width(0.95) * 16, rel=0.02)
-    # White noise: the mean over 10 x 10 pixels has a tenth of the sd; some 280 blocks know it to 4 %.
-    assert found.resolvable_step_area_nm == pytest.approx(found.resolvable_step_nm / 10, rel=0.2)
     for step in found.steps:
         assert step.height_nm == pytest.approx(80, abs=4 * step.uncertainty_nm + 0.5)
         assert step.readability == pytest.approx(5, rel=0.05)
         # Φ(−2.5) = 0.6 % of some 7,000 pixels: sd 0.1 %.
         assert step.misread == pytest.approx(norm.cdf(-2.5), abs=0.004)
-        assert step.misread_if_gaussian == pytest.approx(norm.cdf(-2.5), abs=0.003)
 
 
 def test_a_flat_surface_has_no_steps():
@@ -261,10 +254,10 @@ def test_the_dose_matrix_sees_height_roughness_and_lost_steps():
     assert [row.dose for row in found.rows] == doses
     under, low, nominal, high, over = found.rows
     # Levels 0, 1 and 2 are one height: two steps lost. 0.75 µm is reached below level 6 (0.78 µm).
-    assert (under.lost_low, under.under_exposed, under.over_exposed) == (2, True, False)
-    assert (over.lost_high, over.over_exposed, over.under_exposed) == (2, True, False)
+    assert (under.lost_low, under.lost_high) == (2, 0)
+    assert (over.lost_low, over.lost_high) == (0, 2)
     for row in (low, nominal, high):
-        assert (row.under_exposed, row.over_exposed) == (False, False)
+        assert (row.lost_low, row.lost_high) == (0, 0)
         # The tilt along the ladder is known from the slopes within 9 treads of 20 x 40 px only: the x of a
         # tread spreads by 20/√12 of 360 px, so 6 nm leave 4.4 nm over the field, 0.6 % of 800 nm.
         assert row.height_gain == pytest.approx(row.dose, abs=0.02)
@@ -279,7 +272,7 @@ def test_shrinkage_alone_is_no_wrong_exposure_and_the_nearest_height_wins():
         for dose in (0.9, 1.0, 1.15)
     ]
     found, _ = dose_matrix(shrunk)
-    assert not any(row.under_exposed or row.over_exposed for row in found.rows)
+    assert not any(row.lost_low or row.lost_high for row in found.rows)
     # 0.6 · 1.15 = 0.69 is the nearest to 1.
     assert found.recommended_dose == 1.15
 
@@ -439,26 +432,11 @@ def test_flat_places_show_the_roughness_of_their_level(random):
         )
         for scan in scans
     ]
-    found = noise_budget(Residuals("made", scans, heights_um(scans), [], None, 1, True))
+    found = noise_budget(Residuals("made", scans, heights_um(scans), [], True))
     assert len(found.flat_levels) > 3
     for row in found.flat_levels:
         # A thousand pixels know σ to 2 %; terms from the other half add to it.
         assert row.sigma_nm == pytest.approx(10 + 2 * row.level, rel=0.08)
-    # White noise falls to nothing in one pixel of 0.1 µm, a straight line from 1 to 0: 1/e after 0.063.
-    assert found.flat_length_um == pytest.approx((0.0632, 0.0632), rel=0.05)
-
-
-def test_the_roughness_of_flat_places_hangs_together_as_far_as_it_was_made_to(random):
-    scans = []
-    for scan in make_scans(7, size_px=256, noise_um=0.0):
-        surface = random.normal(0, 0.02, scan.shape)
-        for axis, kept in enumerate((np.exp(-0.1 / 0.3), np.exp(-0.1 / 0.6))):
-            surface = lfilter([np.sqrt(1 - kept**2)], [1, -kept], surface, axis=axis)
-        scans.append(replace(scan, height_um=(scan.height_um + surface).astype(np.float32)))
-    found = noise_budget(Residuals("made", scans, heights_um(scans), [], None, 1, True))
-    # 7 · 256² / 4 pixels over 7 · 13 that hang together: 1,260 heights, 3 % of a correlation of 0.37, so 8 %;
-    # terms of the scans take some of the long waves.
-    assert found.flat_length_um == pytest.approx((0.3, 0.6), rel=0.15)
 
 
 # --- σ(x) and its calibration -------------------------------------------------------------------
@@ -497,7 +475,7 @@ def planted_residuals(count=10, size_px=96, seed=0, freedom=np.inf):
 def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not(freedom):
     scans, residuals, _ = planted_residuals(count=12, freedom=freedom)
     residuals[0][:10] = np.nan
-    found = analyse_spread(Residuals("made", scans, [], residuals, None, 1, True))
+    found = analyse_spread(Residuals("made", scans, [], residuals, True))
     assert found.left_out == "prints"
     assert (found.variance.freedom or np.inf) >= min(freedom, 30)
     constant, by_covariates = found.calibrations
@@ -509,7 +487,6 @@ def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not(freedo
         assert share == pytest.approx(level, abs=0.01)
     # The PIT of the right shape is flat: 1/20 per bin.
     assert np.abs(np.array(by_covariates.pit) - 0.05).max() < 0.004
-    assert by_covariates.conformal_factor == pytest.approx(1.0, abs=0.05)
     everything, *groups = found.bins
     assert everything.coverage_68_ci95 == pytest.approx((0.68, 0.68), abs=0.015)
     assert {row.covariate for row in groups} == {"level", "slope", "edge distance", "radius²"}
@@ -524,37 +501,26 @@ def test_errors_half_as_large_again_as_stated_are_so_for_all_groups_and_scans(ra
     scans, _, sigmas = planted_residuals(count=3)
     errors = [1.5 * sigma * random.choice([-1, 1], sigma.shape) for sigma in sigmas]
     stated = [Stated(sigma, GAUSSIAN) for sigma in sigmas]
-    groups = _bins(scans, [place_maps(scan) for scan in scans], errors, stated)
-    for row in [*groups, *calibrate("exact", scans, errors, stated).scans]:
+    groups = list(_bins(scans, [place_maps(scan) for scan in scans], errors, stated))
+    assert [row.rms_nm for row in groups] == pytest.approx([1.5 * row.predicted_nm for row in groups])
+    # All of them lie between one and two σ.
+    assert {(row.coverage_68, row.coverage_95) for row in groups} == {(0, 1)}
+    judged = calibrate("exact", scans, errors, stated).scans
+    assert [row.standardised_rms for row in judged] == pytest.approx([1.5] * 3)
+    for row in [*groups, *judged]:
         # The order of the errors is that of σ.
         assert (row.ence, row.ause) == pytest.approx((0.5, 0), abs=1e-9)
-    assert [row.rms_nm for row in groups] == pytest.approx([1.5 * row.predicted_nm for row in groups])
 
 
 def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():
     scans, residuals, _ = planted_residuals(count=8)
     assert scans[0].print_id == scans[1].print_id != scans[2].print_id
     loud = [100 * residuals[0], 100 * residuals[1], *residuals[2:]]
-    quiet = analyse_spread(Residuals("made", scans, [], residuals, None, 1, True)).calibrations[1]
-    alarmed = analyse_spread(Residuals("made", scans, [], loud, None, 1, True)).calibrations[1]
+    quiet = analyse_spread(Residuals("made", scans, [], residuals, True)).calibrations[1]
+    alarmed = analyse_spread(Residuals("made", scans, [], loud, True)).calibrations[1]
     # Its own residuals, and those of the same print, do not reach the σ that a scan is judged with.
     assert alarmed.scans[0].standardised_rms == pytest.approx(100 * quiet.scans[0].standardised_rms, rel=1e-9)
     assert alarmed.scans[2].standardised_rms < quiet.scans[2].standardised_rms
-
-
-def test_disagreement_of_members_is_their_sample_spread_without_their_datum():
-    truth = np.random.default_rng(1).normal(0, 0.1, (64, 64))
-    deviations = [rough((64, 64), 0.004, seed) for seed in range(8)]
-    members = [truth + deviation + 0.03 * n for n, deviation in enumerate(deviations)]
-    spread = disagreement_um(members)
-    # Mean square over 4,096 pixels and 7 degrees of freedom: 1 %.
-    assert float(np.sqrt(np.mean(spread**2))) == pytest.approx(0.004, rel=0.03)
-
-
-def test_a_scan_level_promise_needs_scans():
-    assert conformal_factor([1.0] * 8) is None
-    assert conformal_factor(list(range(1, 10))) == 9
-    assert conformal_factor(list(range(1, 20))) == 18
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -573,7 +539,7 @@ def test_a_store_without_references_has_the_floor_that_residuals_show(store, tmp
 
     assert analyse_noise(store, tmp_path / "without").noise_floor.kind == "unknown"
     scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=2)
-    result = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "b"])
+    result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "b")
     assert NoiseAnalysis.read(tmp_path / "out") == result
     # Planted: 4 nm of white noise.
     assert result.noise_floor.kind == "upper-estimate"
@@ -624,23 +590,15 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
     from litho_models.evaluation.benchmark import benchmark
     from litho_models.noise import analyse_noise
 
-    folders = [tmp_path / "b0", tmp_path / "b1"]
-    for seed, folder in enumerate(folders):
-        benchmark(
-            store,
-            folder,
-            models=("affine", "linear"),
-            folds=3,
-            settings={"nuisance": "offset"},
-            open_lock_box=True,
-            seed=seed,
-        )
-    result = analyse_noise(store, tmp_path / "out", residuals=folders)
+    folder = tmp_path / "b"
+    settings = {"nuisance": "offset"}
+    models = ("affine", "linear")
+    benchmark(store, folder, models=models, folds=3, settings=settings, open_lock_box=True)
+    result = analyse_noise(store, tmp_path / "out", residuals=folder)
     spread = result.spread
-    assert (spread.model, spread.members, spread.held_out) == ("linear", 2, True)
-    assert len(spread.calibrations) == 3
+    assert (spread.model, spread.held_out) == ("linear", True)
+    assert len(spread.calibrations) == 2
     assert len(spread.calibrations[0].scans) == 7
-    assert spread.epistemic_rms_nm > 0
     # Planted noise 4 nm; the model adds what it lacks.
     assert 3.9 < spread.residual_rms_nm < 12
     with (tmp_path / "out" / "calibration_scans.csv").open(newline="", encoding="utf-8") as file:
@@ -649,18 +607,16 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
         spread.calibrations[0].levels, spread.calibrations[0].scans[0].coverage, strict=True
     ):
         assert float(rows[0][f"coverage_{100 * level:.0f}"]) == pytest.approx(share, abs=5e-4)
-    chosen = analyse_noise(store, tmp_path / "affine", residuals=folders[:1], model="affine").spread
+    chosen = analyse_noise(store, tmp_path / "affine", residuals=folder, model="affine").spread
     assert chosen.model == "affine"
     assert chosen.residual_rms_nm > spread.residual_rms_nm
     with pytest.raises(InputError, match="model of"):
-        analyse_noise(store, tmp_path / "none", residuals=folders, model="pbl")
-    with pytest.raises(InputError, match="one source twice"):
-        analyse_noise(store, tmp_path / "none", residuals=[folders[0], folders[0]])
+        analyse_noise(store, tmp_path / "none", residuals=folder, model="pbl")
     with pytest.raises(InputError, match="no residuals"):
         analyse_noise(store, tmp_path / "none", model="linear")
     other = write_store(tmp_path / "other.zarr", make_scans(3, size_px=64))
     with pytest.raises(InputError, match="dataset of"):
-        analyse_noise(other, tmp_path / "none", residuals=folders)
+        analyse_noise(other, tmp_path / "none", residuals=folder)
 
 
 def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
@@ -668,14 +624,14 @@ def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
     from litho_models.noise import analyse_noise
 
     train(store, "linear", tmp_path / "run")
-    result = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"])
+    result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "run" / "model")
     spread = result.spread
     assert not spread.held_out
     # What is left of scans that a model was fitted to is no estimate of the noise.
     assert (result.budget, result.noise_floor.kind) == (None, "unknown")
     assert len(spread.calibrations[0].scans) == 7
     with pytest.raises(InputError, match="a frozen one"):
-        analyse_noise(store, tmp_path / "none", residuals=[tmp_path / "run" / "model"], model="linear")
+        analyse_noise(store, tmp_path / "none", residuals=tmp_path / "run" / "model", model="linear")
 
 
 def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
@@ -695,19 +651,13 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
         (tmp_path / "b", scored.nuisance, scored.scores[0]),
         (model, evaluated.nuisance, evaluated.scores),
     ):
-        found = read_residuals(open_store(bowed), [source])
+        found = read_residuals(open_store(bowed), source)
         assert found.protocol == nuisance
         assert nuisance.background == "training"
         # Every pixel is valid, so that the mean over pixels is the mean over scans.
         mae_nm = np.mean(np.abs(found.residuals_nm))
         assert mae_nm == pytest.approx(scores.mae_datum_free_nm, rel=1e-6)
         assert mae_nm < 0.8 * scores.without_background[1].mae_nm
-
-
-def test_the_command_and_its_function_have_one_default():
-    of_files, command = (signature(one).parameters for one in (analyse_noise_of_files, noise))
-    for name in ("level_height_um", "unit", "size_um", "steps", "substrate"):
-        assert of_files[name].default == command[name].default
 
 
 @pytest.mark.pictures
@@ -754,7 +704,7 @@ def test_the_command_takes_single_files(tmp_path):
         (["--steps", "F"], "got --steps, wanted a store, or --flat"),
         (["STORE", "--substrate", "F", "--steps", "F"], "got a store and --substrate, --steps"),
         (["STORE", "--level-height-um", "0.2"], "got a store and --level-height-um"),
-        (["--flat", "F", "--residuals", "B", "--seed", "1"], "got --flat and --residuals, --seed"),
+        (["--flat", "F", "--residuals", "B", "--model", "M"], "got --flat and --residuals, --model"),
         (["--flat", "F", "--level-height-um", "0.2"], "got --level-height-um, wanted --steps"),
     ],
 )

@@ -47,7 +47,7 @@ def test_every_column_of_a_table_is_the_field_that_it_names(name: str, tmp_path:
 
 def test_each_coverage_stands_under_its_level() -> None:
     scan = ScanCalibration(
-        scan="P11", nll=1.0, crps_nm=2.0, coverage=[0.4, 0.7], standardised_rms=1.1, factor_90=1.2
+        scan="P11", nll=1.0, crps_nm=2.0, coverage=[0.4, 0.7], standardised_rms=1.1, ence=0.1, ause=0.5
     )
     stated = SimpleNamespace(name="constant", levels=[0.5, 0.9])
     (row,) = _covered(cast(Any, stated), [scan])

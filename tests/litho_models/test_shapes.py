@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_models.evaluation.fit_cache import tile_consistency
 from litho_models.evaluation.tables import metric_table, metric_text, scan_table
-from litho_models.models import build_model
-from litho_models.prediction.cost import measured_predictions
-from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring import metric_registry
 from litho_models.scoring.metric_registry import register_metric
@@ -179,59 +172,3 @@ def test_a_metric_has_to_be_a_number(own_metrics):
     scan = make_scan(0, 64)
     with pytest.raises(InputError, match="metric map, got a ndarray"):
         score_model("flat", [scan], [Prediction(scan.layout_um)], NuisanceProtocol.of_policy("none"))
-
-
-@pytest.mark.parametrize("name", ["identity", "affine"])
-def test_a_model_of_single_pixels_is_the_same_in_every_crop(name):
-    found = tile_consistency(build_model(name), make_scan(0, 96))
-    assert (found.max_nm, found.rms_nm) == (0, 0)
-    assert found.pixels == 64 * 64
-
-
-def test_a_model_that_looks_at_the_whole_image_is_found_out():
-    scan = make_scan(0, 96)
-    scan.mask_level[0, 0] = 12
-    # The authors' variant divides by the maximum of the image it is given.
-    found = tile_consistency(build_model("physics", "authors"), scan)
-    assert found.max_nm > 1
-
-
-def test_small_fields_leave_nothing_to_compare():
-    assert tile_consistency(build_model("fno"), make_scan(0, 96)) is None
-
-
-def test_predictions_are_measured_and_unchanged():
-    model, scans = build_model("physics"), make_scans(3, size_px=64)
-    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, "cpu")
-    for scan, height in zip(scans, heights, strict=True):
-        assert np.array_equal(height, predict_scan(model, scan))
-    assert cost.seconds_per_scan > 0
-
-
-_MEMORY_IN_USE = """
-import sys
-import torch
-from litho_models.prediction.cost import measured_predictions
-from tests.litho_models.prints import make_scans
-
-def greedy(scan):
-    parts = [torch.ones(2**18) for _ in range(int(sys.argv[1]))]
-    return torch.stack([part[:1] for part in parts]).numpy().copy()
-
-print(measured_predictions(greedy, make_scans(5, size_px=32), "cpu")[1].peak_memory_mib)
-"""
-
-
-@pytest.mark.parametrize("mib", [64, 256])
-def test_memory_held_for_a_moment_is_seen(mib):
-    # In a process of its own: what earlier tests hold (threads, arenas of theirs) may be let go of meanwhile,
-    # and resident memory does not say whose it was.
-    done = subprocess.run(
-        [sys.executable, "-c", _MEMORY_IN_USE, str(mib)], capture_output=True, text=True, check=True
-    )
-    if done.stdout.strip() == "None":
-        pytest.skip("the peak of resident memory cannot be reset here")
-    # Parts of 1 MiB of float32. NumPy asks for pages of 2 MiB for its large arrays, and the allocator hands
-    # such addresses out again after them: then resident memory grows by 2 MiB at a time, once at either end;
-    # the list and whatever else the process does meanwhile are below 1 MiB.
-    assert float(done.stdout) == pytest.approx(mib, abs=2 * 2 + 1)

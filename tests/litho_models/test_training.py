@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_models.fitting import TrainingConfig, fit, fit_with_record
 from litho_models.fitting import stochastic as network
-from litho_models.fitting.checkpoint import CheckpointFolder
+from litho_models.fitting.checkpoint import CheckpointFolder, TrainingState
 from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
 from litho_models.fitting.small_models import fit_small_model
@@ -252,8 +251,6 @@ def test_crops_carry_their_surroundings_and_continue_the_edge():
     assert np.array_equal(inside, field[7:21, 9:23])
     corner = cut(field, Window(0, 0, 0, 8), margin_px=3)
     assert (corner[:3, :3] == field[0, 0]).all()
-    flipped = cut(field, Window(0, 10, 12, 8, flip=(True, False)), margin_px=3)
-    assert np.array_equal(flipped, inside[::-1])
 
 
 def test_passes_change_the_memory_and_not_the_step(monkeypatch):
@@ -388,30 +385,8 @@ def test_bad_requests_are_refused(call):
         call()
 
 
-class OneOfMany:
-    """What a training step asks of its process; sums over processes are left to the test."""
-
-    def __init__(self, rank, world):
-        self.global_rank, self.world_size, self.device = rank, world, torch.device("cpu")
-
-    def to_device(self, batch):
-        return batch
-
-    def no_backward_sync(self, _module, enabled):
-        return nullcontext()
-
-    def backward(self, loss):
-        loss.backward()
-
-    def all_reduce(self, sums):
-        self.sums = sums
-        return torch.ones(2)
-
-
-@pytest.mark.parametrize(
-    "world", [2, pytest.param(3, marks=pytest.mark.long), pytest.param(5, marks=pytest.mark.long)]
-)
-def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch):
+@pytest.mark.parametrize("count", [2, 5])
+def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
     monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     scans = make_scans(3, size_px=64)
     # Unequal weights of the crops: a mean of means would show.
@@ -420,24 +395,27 @@ def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch
     targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
 
     def of_process(rank, count):
+        """What one process adds to the sum over processes."""
+        added = []
+        monkeypatch.setattr(network, "rank_and_count", lambda: (rank, count))
+        monkeypatch.setattr(
+            network, "add_over_processes", lambda own: added.extend(one.clone() for one in own)
+        )
         torch.manual_seed(0)
-        module = network._Heights(build_model("pbl", **SMALL_NETS), config)
-        process = OneOfMany(rank, count)
-        network._step(process, module, torch.optim.SGD(module.parameters()), targets, config, 0)
-        return torch.cat([parameter.grad.flatten() for parameter in module.parameters()]), process.sums
+        model = build_model("pbl", **SMALL_NETS)
+        state = TrainingState(model, torch.optim.SGD(model.parameters()))
+        network._step(state, targets, config, 0, torch.device("cpu"))
+        return torch.cat([one.flatten() for one in added])
 
-    one, sums = of_process(0, 1)
-    every = [of_process(rank, world) for rank in range(world)]
+    one = of_process(0, 1)
+    many = sum(of_process(rank, count) for rank in range(count))
     # Four crops are summed in another order: float32 rounding of the largest term.
-    torch.testing.assert_close(
-        sum(gradient for gradient, _ in every) / world, one, rtol=0, atol=1e-5 * float(one.abs().max())
-    )
-    torch.testing.assert_close(sum(own for _, own in every) / world, sums)
+    torch.testing.assert_close(many, one, rtol=0, atol=1e-5 * float(one.abs().max()))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("world", [2, 3, 5])
-def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
+@pytest.mark.parametrize("count", [2, 5])
+def test_several_processes_give_the_loss_curve_of_one(count, tmp_path):
     from litho_models.fitting.runs import TrainingRun
 
     store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=64))
@@ -445,16 +423,13 @@ def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
     script.write_text(
         "import sys\n"
         "from litho_models.fitting.runs import train\n"
-        "from litho_models.fitting import crops\n"
-        # A pass per crop: processes must add their gradients once per step all the same.
-        "crops._PASS_PX = 1\n"
         "settings = dict(steps=4, rounds=2, batch=4, crop_px=32, precision='32-true', nuisance='offset')\n"
         "settings |= dict(validation_scans=2)\n"
         f"train({str(store)!r}, 'pbl', sys.argv[1], settings=settings)\n"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     subprocess.run([sys.executable, script, tmp_path / "one"], check=True, env=environment)
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world}"]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
     subprocess.run([*torchrun, script, tmp_path / "many"], check=True, env=environment)
     one, many = (TrainingRun.read(tmp_path / name).history for name in ("one", "many"))
     # Gradients are summed in another order: float32 rounding, a few 1e-6 after four steps. The last round is
@@ -464,12 +439,14 @@ def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
         assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=near)
 
 
-@pytest.mark.parametrize(("name", "rate"), [("pbl", 1e6), ("fno", 1e9), ("physics", 1e8)])
+@pytest.mark.parametrize(("name", "rate"), [("pbl", 1e6), ("fno", 1e3), ("fno", 1e9), ("physics", 1e8)])
 def test_a_training_that_diverges_is_told_in_one_line(name, rate, tmp_path):
     config = TrainingConfig(
         recipe="paper", variant="paper" if name != "physics" else "default", learning_rate=rate,
         steps=4, rounds=1, batch=1, crop_px=32, nuisance="offset", validation_scans=0,
     )  # fmt: skip
-    with pytest.raises(InputError, match=rf"^training of {name}, got .* not finite .*smaller learning_rate$"):
+    with pytest.raises(
+        InputError, match=rf"^training of {name}, got .* beyond all heights .*smaller learning_rate$"
+    ):
         fit_with_record(name, make_scans(2, size_px=64), config, checkpoint=tmp_path / "kept")
     assert not list(tmp_path.iterdir())

@@ -164,14 +164,14 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     assert Evaluation.read(tmp_path / "out").model.name == name
     assert freeze(named, tmp_path / "frozen").weights_sha256 == ModelCard.read(there).weights_sha256
     assert [*bases_for(named, Study.dealt(open_store(store).scans(), 2), cache=tmp_path)] == [name]
-    assert read_residuals(open_store(store), [named]).model == name
+    assert read_residuals(open_store(store), named).model == name
     for wrong, said in (("zoo:resnet", name), (name, f"did you mean {named}")):
         with pytest.raises(InputError, match=said):
             zoo.model_folder(wrong)
     wanted = ", ".join(f"zoo:{one}" for one in zoo.list())
     also = "the result of a benchmark or the folder of a model"
     with pytest.raises(InputError, match=f"wanted {wanted}, {also}$"):
-        read_residuals(open_store(store), [tmp_path / "absent"])
+        read_residuals(open_store(store), tmp_path / "absent")
 
 
 def test_listing_the_zoo_loads_no_torch():

@@ -1,0 +1,40 @@
+"""What a print job needs besides the layout: format, base, slices and lines, stated once for all files."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from litho_data.commands.settings import setting
+from litho_data.foundation.quantities import LEVEL_HEIGHT_UM
+from litho_data.foundation.results import Record
+
+Format = Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
+GdsLayers = Literal["cumulative", "exclusive"]
+_MOST = LEVEL_HEIGHT_UM.high
+
+
+class Gwl(Record):
+    """How a Nanoscribe prints the slices."""
+
+    mode: Literal["galvo", "piezo"] = setting("galvo", "What moves the focus", option="--gwl-mode")
+    field_um: float = setting(
+        100.0, "Side of a write field of the galvo", unit="µm", option="--gwl-field-um", gt=0
+    )
+    speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", option="--gwl-speed", gt=0, le=1e7)
+    power_percent: tuple[float, ...] = setting(
+        (50.0,),
+        "Laser power, %: one number, or one for the pedestal and one for every level above it",
+        option="--gwl-power",
+    )
+
+
+class PrintJob(Record):
+    """STL and GWL print the base; the sidecar of every format records it, slicing and hatching."""
+
+    pedestal_um: float = setting(1.0, "Base under level 0", unit="µm", option="--pedestal-um", ge=0, le=_MOST)
+    slicing_um: float = setting(0.1, "Slicing distance", unit="µm", option="--slicing-um", gt=0, le=_MOST)
+    hatching_um: float = setting(0.1, "Hatching distance", unit="µm", option="--hatching-um", gt=0, le=_MOST)
+    gds_layers: GdsLayers = setting(
+        "cumulative", "Whether layer k is level >= k, or level == k", option="--gds-layers"
+    )
+    gwl: Gwl = setting(Gwl(), "GWL")

@@ -1,0 +1,90 @@
+"""What is measured of a printed element: a height map of it, or a photograph of its light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic.dataclasses import dataclass
+
+from litho_data.commands.settings import setting
+
+Levelling = Literal["none", "plane", "bow"]
+
+
+@dataclass(frozen=True)
+class MeasuredSource:
+    """A height map of the printed part; unit and size (one side, or y and x) if the file does not state them.
+
+    ``aligned`` is for elements that look alike in several places or orientations, such as a lens cap or a
+    blaze.
+    """
+
+    path: Path = setting(..., "Height map of the printed part, by AFM", option="--scan")
+    unit: str | None = setting(None, "Unit of the scan's heights, if the file has none", option="--scan-unit")
+    size_um: float | tuple[float, float] | None = setting(
+        None, "Side of the scan, µm, if the file has none", option="--scan-size-um"
+    )
+    levelling: Levelling = setting(
+        "bow",
+        "What is removed from the scan: nothing, a plane, or a bow of second order",
+        option="--scan-levelling",
+    )
+    scale_sd: float = setting(
+        0.02,
+        "Relative standard uncertainty of the microscope's height scale",
+        option="--scan-scale-sd",
+    )
+    aligned: bool = setting(
+        False,
+        "The scan lies upright on the pixels of the element, and is not registered",
+        option="--scan-aligned",
+    )
+    tip_um: float | None = setting(
+        None,
+        "Radius of the tip, whose widening is removed; 0 for none. By default estimated from the scan",
+        unit="µm",
+        option="--scan-tip-um",
+    )
+
+
+@dataclass(frozen=True)
+class PhotoSource:
+    """A photograph of a hologram's image, or of an object through a lens; counts grow with the light."""
+
+    path: Path = setting(
+        ..., "Photograph of the printed hologram's image, or through the printed lens", option="--camera"
+    )
+    pitch_um: float = setting(
+        ..., "Pixel of the photograph in the image plane", unit="µm", option="--camera-pitch-um"
+    )
+    dark_level: float | None = setting(
+        None, "Dark level of the photograph, counts", option="--camera-dark-level"
+    )
+    imaged: str | None = setting(
+        None,
+        "Object in front of the lens: one of the design's objects by name, or a picture",
+        option="--camera-object",
+    )
+    orientation: str = setting(
+        "identity",
+        "Operation that makes the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
+        "flip-y, transpose or anti-transpose; refused if another one fits better",
+        option="--camera-orientation",
+    )
+    power_counts: float | None = setting(
+        None,
+        "Summed counts, without dark level, of all light on the element at the same exposure: gives "
+        "efficiencies",
+        option="--camera-power",
+    )
+    pitch_sd: float = setting(
+        0.0,
+        "Relative standard uncertainty of that pixel, if the magnification is uncertain",
+        option="--camera-pitch-sd",
+    )
+    flat: Path | None = setting(
+        None,
+        "Photograph of uniform light by the same camera, to correct vignetting",
+        option="--camera-flat",
+    )

@@ -1,0 +1,42 @@
+"""Plain gradient descent of a few free numbers, for baselines without a printer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+# It needs gradients, even if the caller disabled them, as scores mostly do.
+@torch.enable_grad()
+def descended(
+    free: Iterable[Tensor],
+    loss: Callable[[], tuple[Tensor, T]],
+    *,
+    rate: float,
+    iterations: int,
+    project: Callable[[], object] = lambda: None,
+) -> tuple[T, float]:
+    """Minimise ``loss`` by Adam; returns the second result of the best step, and its loss.
+
+    Args:
+        free: the numbers to change, in place.
+        loss: the loss at their present values, and a result that does not change with them.
+        project: called after every step, to bring the numbers back into their range.
+    """
+    optimiser = torch.optim.Adam(free, lr=rate)
+    found: tuple[T, float] | None = None
+    for _ in range(iterations):
+        value, result = loss()
+        if found is None or float(value.detach()) < found[1]:
+            found = result, float(value.detach())
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+        project()
+    assert found is not None, "no iteration"
+    return found

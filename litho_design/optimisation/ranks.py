@@ -1,0 +1,84 @@
+"""The processes that share an element: those started by torchrun, or only this one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The number of this process among all; sums and exchanges carry gradients."""
+
+    rank: int = 0
+    count: int = 1
+
+    @classmethod
+    def joined(cls) -> Ranks:
+        """Join the processes of torchrun, over gloo for processors and NCCL for GPUs; alone without it."""
+        if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+            return cls()
+        if not dist.is_initialized():
+            if torch.cuda.is_available():
+                torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+            dist.init_process_group()
+        return cls(dist.get_rank(), dist.get_world_size())
+
+    @property
+    def part(self) -> str:
+        """This process in the names of files that each process writes; empty if it is alone."""
+        return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
+
+    def device(self, device: str | torch.device) -> str | torch.device:
+        """``device`` for this process; with ``cuda`` each process takes a GPU of its own."""
+        return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
+
+    def share(self, count: int, rank: int | None = None) -> range:
+        """The range among ``count`` items that belongs to a process, by default this one."""
+        place = self.rank if rank is None else rank
+        return range(count * place // self.count, count * (place + 1) // self.count)
+
+    def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
+        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated flat.
+
+        Args:
+            parts: one tensor per process, real or complex, of one dtype.
+        """
+        if self.count == 1:
+            return parts[0].reshape(-1)
+        from torch.distributed.nn.functional import all_to_all_single
+
+        sent = torch.cat([part.reshape(-1) for part in parts])
+        # The collectives of gloo do not support complex numbers.
+        given = torch.view_as_real(sent) if sent.is_complex() else sent
+        room = given.new_empty((sum(sizes), *given.shape[1:]))
+        got: Tensor = all_to_all_single(room, given, list(sizes), [part.numel() for part in parts])
+        return torch.view_as_complex(got) if sent.is_complex() else got
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sum over the values of all processes, () float64; the gradient adds up what each makes of it."""
+        own = values.sum(dtype=torch.float64)
+        if self.count == 1:
+            return own
+        from torch.distributed.nn.functional import all_reduce
+
+        total: Tensor = all_reduce(own)
+        return total
+
+    def any(self, value: bool) -> bool:
+        """Whether ``value`` holds for any process; waits for all of them."""
+        return bool(self.total(torch.tensor([float(value)])) > 0)
+
+    def wait(self) -> None:
+        """Wait until all processes are here."""
+        if self.count > 1:
+            dist.barrier()
+
+
+# This process, if no other shares the element.
+ALONE = Ranks()

@@ -1,0 +1,44 @@
+"""Tables of figures, levels and distances that reports share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.results import Record
+from litho_design.tasks.design import Design
+
+
+def meanings(score: type[Record]) -> dict[str, str]:
+    """The meaning of each number of a score."""
+    return {name: field.description or "" for name, field in score.model_fields.items()}
+
+
+def score_table(
+    columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """One row per figure, one column per print or baseline, and the meaning of each figure."""
+    # A task of your own need not describe its figures.
+    names = dict.fromkeys(
+        name for figures in columns.values() for name in figures if name in labels or not labels
+    )
+    return [
+        {"name": name}
+        | {title: figures.get(name, np.nan) for title, figures in columns.items()}
+        | ({"meaning": labels[name]} if labels else {})
+        for name in names
+    ]
+
+
+def level_table(design: Design) -> dict[str, Any]:
+    """Level, nominal and printed height, and printed waves above level 0."""
+    printed, step_um = design.stroke.printed_height_um, design.layout.level_height_um
+    wave_um = design.optics.wave_height_um
+    return {
+        "level": range(len(printed)),
+        "nominal_um": [level * step_um for level in range(len(printed))],
+        "printed_um": printed,
+        "printed_waves": [(height - printed[0]) / wave_um for height in printed],
+    }
