@@ -109,8 +109,6 @@ def match_blur(
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """The warp of a lower rung that moves the corners of the field most nearly as a given warp does."""
-    from skimage.transform import estimate_transform
-
     if model == "homography":
         return matrix
     if model == "affine":
@@ -118,9 +116,13 @@ def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
         return _about(linear_part(matrix, middle), middle, apply_transform(matrix, middle[None])[0])
     points = corners(shape)
     moved = apply_transform(matrix, points)
-    linear = np.eye(2)
-    if model != "translation":
-        linear = estimate_transform(model, points, moved).params[:2, :2]
+    source, target = (p[:, 0] + 1j * p[:, 1] for p in (points - points.mean(0), moved - moved.mean(0)))
+    turn = np.vdot(source, target) / np.vdot(source, source)
+    if model == "translation":
+        turn = np.complex128(1.0)
+    elif model == "euclidean":
+        turn = turn / abs(turn)
+    linear = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
     return _about(linear, points.mean(0), moved.mean(0))
 
 
