@@ -242,7 +242,8 @@ def score_design(folder: Path) -> None:
 
 
 def sheet(folder: Path) -> None:
-    made = hologram_settings(changes=_SMALL_OPTICS)
+    # Random layouts of a smaller field would have a coarser pattern.
+    made = hologram_settings(changes=_SMALL_OPTICS | {"layout.size_px": 64})
     new_sheet(folder / "out", model="zoo:physics", settings=made, format="png16", layouts=6, announce=False)
 
 

@@ -226,6 +226,7 @@ def _plain(template: Path) -> jinja2.Template:
     environment = jinja2.Environment(
         trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
+    environment.filters["without_unit"] = lambda key: spelt_out(key).partition(" (")[0]
     return environment.from_string(template.read_text(encoding="utf-8"))
 
 
