@@ -22,7 +22,7 @@ StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 
 class SearchSettings(Record):
-    """How the layout is searched; every choice that the paper leaves open is a recorded setting."""
+    """Settings of the search, including every choice that the paper leaves open."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"start_iterations", "start_jitter_levels", "hard_from"})
 

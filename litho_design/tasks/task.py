@@ -42,7 +42,7 @@ class Figures(Record):
 
 
 class Task:
-    """What is wanted behind an element, ready to be optimised and scored through printers.
+    """A goal for the light behind an element, which can be optimised and scored through printers.
 
     For a task of your own, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``,
     and pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report
