@@ -238,7 +238,9 @@ def export_design(folder: Path) -> None:
 
 
 def score_design(folder: Path) -> None:
-    score(folder / "design", folder / "out", judges=["zoo:physics"])
+    # The record names the folder of the design as it was given.
+    os.chdir(folder)
+    score("design", "out", judges=["zoo:physics"])
 
 
 def sheet(folder: Path) -> None:
