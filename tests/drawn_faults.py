@@ -71,11 +71,10 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
 def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
     """All of the bodies of functions, but what only types and messages hold."""
     for child in ast.iter_child_nodes(tree):
-        if isinstance(child, ast.arguments | ast.JoinedStr | ast.Raise) or child is getattr(
-            tree, "annotation", 0
-        ):
+        types = getattr(tree, "annotation", 0), getattr(tree, "returns", 0)
+        if isinstance(child, ast.arguments | ast.JoinedStr | ast.Raise) or child in types:
             continue
-        if within and child is not getattr(tree, "returns", 0):
+        if within:
             yield child
         yield from expressions(child, within=within or isinstance(tree, ast.FunctionDef))
 

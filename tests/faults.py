@@ -187,6 +187,9 @@ FAULTS = [
     Fault("an unknown distance of layouts without levels", "litho_design/reports/advice.py",
           "LEVELS_FILE not in design.files", "LEVELS_FILE in design.files",
           "tests/litho_design/test_fabrication.py -k unknown_distance"),
+    Fault("every process with the same crops", "litho_models/fitting/stochastic.py",
+          "batch[rank::count]", "batch[::count]",
+          "tests/litho_models/test_training.py -k any_number_of_processes"),
     Fault("a spread calibrated by its errors", "litho_models/noise/calibration.py",
           "ence=normalised_calibration_error(residual[mine], sigma[mine])",
           "ence=normalised_calibration_error(sigma[mine], residual[mine])",
@@ -232,6 +235,12 @@ FAULTS = [
           "tests/litho_models/test_benchmark_messages.py -k one_estimate"),
     Fault("a long table that is not folded", "litho_models/planning/report.py",
           'page.heading("Scans", folded=True)', 'page.heading("Scans", folded=False)', f"{NEXT} -k waiting"),
+    Fault("a window at the place of the other axis", "litho_models/fitting/small_models.py",
+          "Window(0, y, x, size)", "Window(0, y, y, size)",
+          "tests/litho_models/test_training.py -k four_corners"),
+    Fault("a model's name taken for a loaded one", "litho_design/printers/source.py",
+          "if isinstance(item, str):\n            first", "if isinstance(str, item):\n            first",
+          "tests/litho_design/test_frozen_printer.py -k as_words"),
 ]  # fmt: skip
 
 

@@ -238,11 +238,14 @@ def export_design(folder: Path) -> None:
 
 
 def score_design(folder: Path) -> None:
-    score(folder / "design", folder / "out", judges=["zoo:physics"])
+    # The record names the folder of the design as it was given.
+    os.chdir(folder)
+    score("design", "out", judges=["zoo:physics"])
 
 
 def sheet(folder: Path) -> None:
-    made = hologram_settings(changes=_SMALL_OPTICS)
+    # Random layouts of a smaller field would have a coarser pattern.
+    made = hologram_settings(changes=_SMALL_OPTICS | {"layout.size_px": 64})
     new_sheet(folder / "out", model="zoo:physics", settings=made, format="png16", layouts=6, announce=False)
 
 

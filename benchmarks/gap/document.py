@@ -15,8 +15,8 @@ from benchmarks.gap.tables import as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.judging.gap import GapResult, design_folder
-from litho_design.judging.loaded import task_named
 from litho_design.tasks.design import Design
+from litho_design.tasks.task import registered_task
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "gap.md", DOCS / "results" / "gap"
@@ -111,6 +111,6 @@ def _frame(name: str, gap: GapResult) -> pd.DataFrame:
             "high": None if item.judged_ci95 is None else item.judged_ci95[1],
         }
         for item in gap.summary
-        if item.figure in task_named(gap.task).headline
+        if item.figure in registered_task(gap.task).headline
     ]
     return pd.DataFrame(rows)

@@ -37,7 +37,7 @@ def load_card(path: str | Path) -> Card:
 
 
 def check_card(content: dict[str, Any], what: str) -> Card:
-    """The same checks on a card that is already a dict."""
+    """Check a card that is already a dict."""
     try:
         return Card.model_validate(content)
     except ValidationError as error:
@@ -118,7 +118,7 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 
 
 class LayoutFiles(Record):
-    """What was sent to the printer.
+    """The layout files.
 
     ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
     255 / (levels - 1) where white is the highest level. ``average_px``: the files are black-and-white
@@ -143,7 +143,7 @@ class LayoutFiles(Record):
 
 
 class ScanFiles(Record):
-    """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it.
+    """The scan files. ``size_um`` is (y, x), for formats that do not carry it.
 
     ``instrument``: the kind of microscope. The files of ``sem``, a scanning electron microscope, are pictures
     of a film of the layout's full height; the build measures the edges of the film.
@@ -175,7 +175,7 @@ class ScanFiles(Record):
 
 
 class Process(Record):
-    """How raw scans become heights on the layout grid: a levelling recipe file, a registration model, a tip.
+    """The processing of raw scans: a levelling recipe file, a registration model, a tip.
 
     Without ``level``, the layout-aware plane is subtracted from scans that are not level yet. ``tip`` is the
     radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
@@ -187,7 +187,7 @@ class Process(Record):
 
 
 class Ids(Record):
-    """What an id means: a regular expression for the whole id, and a CSV table with more about it."""
+    """The meaning of ids: a regular expression for the whole id, and a CSV table with further facts."""
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None
     table: InsidePath | None = None
@@ -232,7 +232,7 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """How the printer wrote a field; missing facts are assumed, and labelled as assumptions.
+    """Facts about the writing of a field; missing facts are assumed, and labelled as assumptions.
 
     ``surround``: what lies around a printed field, the bare substrate or more of the print.
     """

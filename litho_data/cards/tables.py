@@ -89,10 +89,6 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         ("surround", get_args(Surround)),
     ):
         require_known(f"{what}: {name}", row.get(name, known[0]), known)
-    if float(row.get("pixel_size", 1)) <= 0:
-        raise InputError(
-            f"{what}: pixel_size", got=repr(row["pixel_size"]), wanted="a number above 0; 0.5 is half"
-        )
 
 
 def size_of(text: str) -> YX | None:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -134,18 +134,15 @@ def simulate(
         raise InputError(
             "--plan and --fab", got="one of them", wanted="both: the plan to print and the fab that prints it"
         )
+    shaped = any(value is not None for value in (count, size_px, write_field_um))
     if plan is not None and fab is not None:
-        if (
-            layouts is not None
-            or knob
-            or any(value is not None for value in (count, size_px, write_field_um))
-        ):
+        if layouts is not None or knob or shaped:
             wanted = "only --out and --seed: plan and fab set the rest"
             raise InputError("options beside --plan", wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
         return
-    if layouts is not None and any(value is not None for value in (count, size_px, write_field_um)):
+    if layouts is not None and shaped:
         wanted = "no --count, --size-px or --write-field-um: the card's layouts set them"
         raise InputError("options beside --layouts", wanted=wanted)
     if preset in FILM_PRINTERS:
@@ -153,23 +150,19 @@ def simulate(
         card = simulate_films(out, preset, count=count or 12, size_px=size_px or 256, seed=seed, knobs=knobs)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / FilmTruth.FILE_NAME}")
         return
-    chosen = named_preset(preset)
-    printer = chosen.printer
+    given = {"count": count, "size_px": size_px, "knobs": knob, "noise": noise, "microscope": microscope}
+    overruled = {name: value for name, value in given.items() if value not in (None, "default")}
+    settings: dict[str, Any] = vars(named_preset(preset)) | overruled
+    printer = settings["printer"]
     if stitch_field_um is not None:
         if not printer.pitch_um <= stitch_field_um <= LENGTH_UM.high:
             wanted = f"the pitch, {printer.pitch_um:g} µm, or more, and at most {LENGTH_UM.high:g} µm"
             raise InputError("--stitch-field-um", got=stitch_field_um, wanted=wanted)
-        printer = replace(printer, stitch_field_um=stitch_field_um)
+        printer = settings["printer"] = replace(printer, stitch_field_um=stitch_field_um)
     card = simulate(
         out,
-        count=count or chosen.count,
-        size_px=size_px or chosen.size_px,
-        fields_per_print=chosen.fields_per_print,
+        **settings,
         seed=seed,
-        knobs=knob if knob is not None else chosen.knobs,
-        noise=chosen.noise if noise == "default" else noise,
-        microscope=chosen.microscope if microscope == "default" else microscope,
-        printer=printer,
         write_field_um=write_field_um,
         references=references,
         metadata=metadata,

@@ -1,1 +1,1 @@
-"""What the three command lines share: settings as options, progress, errors of one line."""
+"""The common part of the three command lines: settings as options, progress, errors of one line."""

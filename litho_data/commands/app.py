@@ -1,4 +1,4 @@
-"""What the three command lines share: their settings, exit codes, and errors of one line."""
+"""The common part of the three command lines: settings, exit codes, and errors of one line."""
 
 import errno
 import functools

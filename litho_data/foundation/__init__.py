@@ -1,1 +1,1 @@
-"""What all packages use: errors, files, hashes, units, records, run facts, commands, reports."""
+"""Parts that all packages use: errors, files, hashes, units, records, run facts."""

@@ -1,4 +1,4 @@
-"""What ``--out`` may be, for every command: nothing but an older result of its own is ever replaced.
+"""Rules for ``--out`` of every command, which only ever replaces its own older result.
 
 A missing or empty folder is accepted. If the folder holds an earlier run of the same command on the same
 subject (dataset, model, design) with the same settings, the run resumes or its result is made again. Anything

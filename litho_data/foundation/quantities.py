@@ -1,4 +1,4 @@
-"""What physical numbers can be, stated once: a type for records, and a check for everything else."""
+"""Allowed ranges of physical numbers: a type for records, and a check for everything else."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""What every result says about the run that made it: command, commit, versions, seeds, scans."""
+"""Facts in every result about its run: command, commit, versions, seeds, scans."""
 
 import platform
 import subprocess

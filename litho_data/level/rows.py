@@ -168,7 +168,7 @@ def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
 
 
 def _fewest(lines: Array) -> int:
-    """How many selected values a row needs before its own estimate counts."""
+    """Fewest selected values of a row for its own estimate."""
     return int(np.log(lines.shape[1]) + 1.5)
 
 

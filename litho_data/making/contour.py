@@ -92,7 +92,7 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
-    """Where a micrograph shows a defect: film deep in a gap of the layout, or a pit in the film.
+    """Find defects in a micrograph: film deep in a gap of the layout, or a pit in the film.
 
     A gap that is closed entirely, or an island that is lost entirely, counts as print.
 

@@ -96,8 +96,11 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
-    page.heading("Quality of every scan, in numbers", folded=True)
     shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
+    if len(shown.columns) == 1:
+        # Pairs that come without their scans: nothing but names is known.
+        return
+    page.heading("Quality of every scan, in numbers", folded=True)
     page.table(
         shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
     )

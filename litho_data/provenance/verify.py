@@ -36,7 +36,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What ``verify`` found. ``notes`` are worth knowing but report no damage."""
+    """The result of ``verify``. ``notes`` report no damage."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]

@@ -1,8 +1,10 @@
 """Read self-describing arrays (HDF5 of any program, NetCDF 3 and 4, MATLAB) with scale, unit and axes."""
 
+from __future__ import annotations
+
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -179,9 +181,49 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
     return np.ascontiguousarray(values[:, :: -1 if mirrored else 1]), None
 
 
-def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Channel]]]) -> list[Channel]:
-    with foreign_parser(path, kind):
-        return [one_by_one(path, kind, name, make) for name, make in made]
+@dataclass(frozen=True)
+class Held:
+    """An array in a file: type, shape, how to read it, and what the file says about it."""
+
+    dtype: np.dtype
+    shape: Shape
+    read: Callable[[], Array]
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    dims: tuple[str, ...] = ("", "")
+
+    @classmethod
+    def in_memory(cls, values: Array, *described: Any) -> Held:
+        """An array that was read already."""
+        native = np.array(values, dtype=values.dtype.newbyteorder("="))
+        return cls(native.dtype, native.shape, partial(np.array, native), *described)
+
+
+def channels_of(
+    path: Path, kind: str, held: Mapping[str, Held], around: Mapping[str, Any] | None = None
+) -> list[Channel]:
+    """One channel per two-dimensional array of numbers in a file.
+
+    Arrays along one dimension are coordinates, single values say something about all others, and so does
+    ``around``. A map with a mask beside it is refused.
+    """
+    numbers = {name: one for name, one in held.items() if one.dtype.kind in f"{_NUMBERS}c"}
+    lines = {
+        name: _coordinate(one.read().ravel(), one.attributes) for name, one in held.items() if _is_line(one)
+    }
+    single = {name: one.read().ravel()[0] for name, one in held.items() if _size(one) == 1}
+    masks = {one.shape: name for name, one in held.items() if one.dtype.kind == "b"}
+
+    def channel(name: str, one: Held) -> Channel:
+        refuse_mask(one.shape, masks)
+        beside = {**(around or {}), **single}
+        dims = (one.dims[0], one.dims[1])
+        return array_channel(name, one.dtype, one.shape, one.read, one.attributes, dims, lines, beside)
+
+    return [
+        one_by_one(path, kind, name, partial(channel, name, one))
+        for name, one in numbers.items()
+        if len(one.shape) == 2 and min(one.shape) > 1
+    ]
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
@@ -193,8 +235,10 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
     matlab = b"MATLAB" in path.open("rb").read(16)
     maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
     masks = {item.shape: item.name for item in datasets if item.dtype.kind == "b"}
-    named = [(item.name.strip("/"), partial(_hdf5_channel, path, item, matlab, masks)) for item in maps]
-    return _channels(path, "HDF5", iter(named))
+    return [
+        one_by_one(path, "HDF5", item.name.strip("/"), partial(_hdf5_channel, path, item, matlab, masks))
+        for item in maps
+    ]
 
 
 def refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
@@ -247,15 +291,13 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str
     )
 
 
-def lines_and_numbers(held: Mapping[str, Array]) -> tuple[dict[str, Coordinate], dict[str, Any]]:
-    """Separate arrays by name into one-dimensional ones, as coordinates, and single values."""
-    lines = {name: Coordinate(one.ravel().astype(float), None) for name, one in held.items() if _is_line(one)}
-    return lines, {name: one.ravel()[0] for name, one in held.items() if one.size == 1}
-
-
 def _is_line(array: Any) -> bool:
     """Whether an array holds numbers along one dimension; MATLAB's have two."""
-    return array.dtype.kind in _NUMBERS and array.size > 1 and max(array.shape) == array.size
+    return array.dtype.kind in _NUMBERS and _size(array) > 1 and max(array.shape) == _size(array)
+
+
+def _size(array: Any) -> int:
+    return int(np.prod(array.shape))
 
 
 def _dataset(path: Path, name: str) -> Array:
@@ -284,26 +326,12 @@ def read_netcdf(path: Path) -> list[Channel]:
 
     with foreign_parser(path, "NetCDF"), netcdf_file(path, "r", mmap=False) as file:
         held = {
-            name: _coordinate(np.array(one[:]), one._attributes)
+            name: Held.in_memory(
+                np.array(one[:]) if one.shape else np.array(one.getValue()), one._attributes, one.dimensions
+            )
             for name, one in file.variables.items()
-            if one.dimensions == (name,)
         }
-        arrays = {name: one for name, one in file.variables.items() if len(one.shape) == 2}
-        around = dict(file._attributes)
-        return _channels(
-            path,
-            "NetCDF",
-            (
-                (name, partial(_in_memory, name, one[:], one._attributes, one.dimensions, held, around))
-                for name, one in arrays.items()
-                if min(one.shape) > 1
-            ),
-        )
-
-
-def _in_memory(name: str, values: Array, *described: Any) -> Channel:
-    native = np.array(values, dtype=values.dtype.newbyteorder("="))
-    return array_channel(name, native.dtype, native.shape, partial(np.array, native), *described)
+        return channels_of(path, "NetCDF", held, dict(file._attributes))
 
 
 def read_matlab(path: Path) -> list[Channel]:
@@ -316,15 +344,9 @@ def read_matlab(path: Path) -> list[Channel]:
     from scipy.io import loadmat
 
     with foreign_parser(path, "MATLAB"):
-        held = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
-    maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
-    beside = lines_and_numbers(held)
-    named = (
-        (name, partial(_in_memory, name, one, {}, ("", ""), *beside))
-        for name, one in maps.items()
-        if one.dtype.kind in "uifc"
-    )
-    return _channels(path, "MATLAB", named)
+        found = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
+        held = {name: Held.in_memory(one) for name, one in found.items() if not one.dtype.hasobject}
+        return channels_of(path, "MATLAB", held)
 
 
 _IMPORTS = ("scipy.io", "h5py")

@@ -7,15 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
-from litho_data.readers.arrays import array_channel, lines_and_numbers, refuse_mask
-from litho_data.readers.reader import (
-    MOST_BYTES_PER_PACKED_BYTE,
-    Channel,
-    Reader,
-    foreign_parser,
-    one_by_one,
-)
+from litho_data.foundation.kinds import Array
+from litho_data.readers.arrays import Held, array_channel, channels_of
+from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Reader, foreign_parser
 
 _ZIP_MAGIC = b"PK\x03\x04"
 _NAME_AT = 30
@@ -45,9 +39,7 @@ def read_archive(path: Path) -> list[Channel]:
     Raises:
         InputError: damaged file.
     """
-    maps: dict[str, tuple[Shape, np.dtype]] = {}
-    masks: dict[Shape, str] = {}
-    beside: dict[str, Array] = {}
+    held: dict[str, Held] = {}
     with foreign_parser(path, "NPZ"), zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             with archive.open(member) as stream:
@@ -56,22 +48,9 @@ def read_archive(path: Path) -> list[Channel]:
             if not whole or member.file_size > MOST_BYTES_PER_PACKED_BYTE * member.compress_size:
                 raise InputError(f"{path}: {member.filename}", got=f"{member.file_size} bytes", wanted=shape)
             name = member.filename.removesuffix(".npy")
-            if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
-                maps[name] = shape, dtype
-            elif dtype.kind == "b":
-                masks[shape] = name
-            elif len(shape) < 2 and not dtype.hasobject:
-                beside[name] = _member(path, name)
-    lines, around = lines_and_numbers(beside)
-
-    def channel(name: str) -> Channel:
-        shape, dtype = maps[name]
-        refuse_mask(shape, masks)
-        return array_channel(
-            name, dtype, shape, partial(_member, path, name), {}, coordinates=lines, around=around
-        )
-
-    return [one_by_one(path, "NPZ", name, partial(channel, name)) for name in maps]
+            if not dtype.hasobject:
+                held[name] = Held(dtype, shape, partial(_member, path, name))
+    return channels_of(path, "NPZ", held)
 
 
 def _member(path: Path, name: str) -> Array:

@@ -1,4 +1,4 @@
-"""What a reader is: it recognises a file and describes its channels before they are loaded."""
+"""The interface of a reader, which recognises a file and describes its channels before they are loaded."""
 
 import logging
 import re
@@ -96,7 +96,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Reader:
-    """How one file format is recognised and read.
+    """A file format: how to recognise and read it.
 
     Args:
         name: as in ``format = "…"`` of a card and ``--format`` of the commands.

@@ -8,7 +8,7 @@ import numpy as np
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.flows import LADDER, Model
-from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
+from litho_data.register.geometry import apply_transform, centre, corners, linear_part, warped_grid
 from litho_data.register.refine import TOLERANCE_PX, Refinement, refine, residual_energy, solve_gram
 from litho_data.register.topography import (
     fill_gaps,
@@ -109,12 +109,11 @@ def match_blur(
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """The warp of a lower rung that moves the corners of the field most nearly as a given warp does."""
-    if LADDER[model] >= LADDER["affine"]:
-        if model == "homography":
-            return matrix
-        middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-        linear = linear_part(matrix, middle[0])
-        return _about(linear, middle[0], apply_transform(matrix, middle)[0])
+    if model == "homography":
+        return matrix
+    if model == "affine":
+        middle = centre(shape)
+        return _about(linear_part(matrix, middle), middle, apply_transform(matrix, middle[None])[0])
     points = corners(shape)
     moved = apply_transform(matrix, points)
     source, target = (p[:, 0] + 1j * p[:, 1] for p in (points - points.mean(0), moved - moved.mean(0)))

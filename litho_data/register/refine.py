@@ -96,7 +96,6 @@ def refine(
     complete = bool(measured.all())
     spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
     matrix, converged, step_px = np.array(start, dtype=float), False, np.inf
-    sums = _Sums(regressors)
     for iteration in range(max_iterations + 1):
         rows, columns = warped_grid(matrix, shape, bend)
         inside = interior & (rows > 0) & (rows < scan.shape[0] - 1)
@@ -104,7 +103,8 @@ def refine(
         if not complete:
             inside &= map_coordinates(measured.astype(np.float32), (rows, columns), order=1) > 0.999
         warped = map_coordinates(spline, (rows, columns), order=3, mode="mirror", prefilter=False)
-        coefficients = solve_gram(sums.gram(warped, inside))
+        gram = _cell_grams(regressors, warped, inside)
+        coefficients = solve_gram(gram.sum(axis=(0, 1)))
         if coefficients[0] <= 0 or bend is not None:
             break
         warp = coefficients[NUISANCES:] / coefficients[0]
@@ -118,14 +118,14 @@ def refine(
             break
         matrix = matrix @ np.linalg.inv(increment)
         matrix /= matrix[2, 2]
-    return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
+    return Refinement(model, matrix, warped, gram, converged, bend)
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
     """``gram`` of a scan that is already aligned with the topography (ny, nx), NaN where not measured.
 
-    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further`` regressors (ny, nx)
-    follow these.
+    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further``: more regressors (ny,
+    nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)
@@ -189,23 +189,6 @@ def _regressors(topography: Array, count: int) -> Array:
     ]
     centred = topography.astype(np.float32) - topography.mean()
     return np.stack([centred, *quadratic_basis(shape).astype(np.float32), *change])
-
-
-class _Sums:
-    """Inner products over the whole field; those of the regressors are kept while the overlap stays."""
-
-    def __init__(self, regressors: Array):
-        self._regressors = regressors
-        self._inside = np.zeros(0, bool)
-
-    def gram(self, warped: Array, inside: Array) -> Array:
-        """The products (k, k) of regressors and scan over the pixels inside."""
-        if not np.array_equal(inside, self._inside):
-            self._inside, self._chosen = inside, self._regressors[:, inside].astype(float)
-            self._normal = self._chosen @ self._chosen.T
-        scan = warped[inside].astype(float)
-        right = self._chosen @ scan
-        return np.block([[self._normal, right[:, None]], [right[None, :], scan @ scan]])
 
 
 def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:

@@ -42,7 +42,7 @@ BENT_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Registration:
-    """Where a scan lies on its layout.
+    """The registration of a scan on its layout.
 
     ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's; both frames
     have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, it is the best guess, or the

@@ -216,7 +216,7 @@ def filled(template: Path, **values: object) -> str:
 
 
 def sentences(template: Path, about: str, one: object) -> str:
-    """What a macro of a template says about one thing, in one line."""
+    """Render a macro of a template in one line."""
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
 
@@ -226,6 +226,7 @@ def _plain(template: Path) -> jinja2.Template:
     environment = jinja2.Environment(
         trim_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
+    environment.filters["without_unit"] = lambda key: spelt_out(key).partition(" (")[0]
     return environment.from_string(template.read_text(encoding="utf-8"))
 
 

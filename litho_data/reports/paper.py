@@ -49,7 +49,7 @@ def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iter
 
 
 def wanted() -> PaperCopies:
-    """The copies that the surrounding ``paper_copies`` asks for."""
+    """The copies requested by the surrounding ``paper_copies``."""
     return _WANTED.get() or PaperCopies()
 
 

@@ -32,6 +32,8 @@ DARK = {
     "band": "#1d232b",
     "accent": "#6cb8ea",
 }
+# Colours of a figure that change with the screen's.
+_OF_SCREEN = ("ink", "paper", "soft", "accent")
 # One colour per model on every page; its contrast is 3:1 on light and dark paper (tests/test_report.py).
 _MODEL_COLOURS = {
     "identity": "#868d98",
@@ -72,7 +74,7 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
 
 
 def svg_address(figure: Figure) -> str:
-    """Data address of a figure as SVG; its black and white are the ink and paper of the screen's colours."""
+    """Data address of a figure as SVG; its colours of ``LIGHT`` change with the screen."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
@@ -80,13 +82,11 @@ def svg_address(figure: Figure) -> str:
     # Not savefig, which lays out and draws everything twice.
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
-    for word in ("ink", "paper"):
+    for word in _OF_SCREEN:
         text = re.sub(rf"{LIGHT[word]}\b", f"var(--{word})", text)
     text = re.sub(r"#000000\b", "var(--ink)", text)
-    style = (
-        f"svg {{ --ink:{LIGHT['ink']}; --paper:{LIGHT['paper']}; fill:var(--ink) }} "
-        f"@media (prefers-color-scheme: dark) {{ svg {{ --ink:{DARK['ink']}; --paper:{DARK['paper']} }} }}"
-    )
+    light, dark = ("; ".join(f"--{word}:{own[word]}" for word in _OF_SCREEN) for own in (LIGHT, DARK))
+    style = f"svg {{ {light}; fill:var(--ink) }} @media (prefers-color-scheme: dark) {{ svg {{ {dark} }} }}"
     text = text.replace("</style>", f"{style}</style>", 1)
     return f"data:image/svg+xml;base64,{_base64(text.encode())}"
 

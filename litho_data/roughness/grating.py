@@ -91,12 +91,8 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
     places, phases = _phases(across * np.exp(-2j * np.pi * wave.x_per_um * x), x, 1 / wave.x_per_um)
     displaced_um = phases / (2 * np.pi * wave.x_per_um)
     from_middle = 2 * (places - x.mean()) / (len(x) * pitch_um[1])
-    design = np.column_stack([np.ones_like(places), from_middle, -(from_middle**2)])
-    weights, *_ = np.linalg.lstsq(design, displaced_um, rcond=None)
-    rest = displaced_um - design @ weights
-    freedom = max(len(places) - 3, 1)
-    variance = float(rest @ rest) / freedom * _OVERLAP_VARIANCE * np.linalg.inv(design.T @ design)[2, 2]
-    return float(weights[2]), _wider(freedom) * float(np.sqrt(variance))
+    weight, error, _ = _last_weight([np.ones_like(places), from_middle, -(from_middle**2)], displaced_um)
+    return weight, error
 
 
 def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
@@ -161,13 +157,18 @@ def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array
 
 def _line(places: Array, phases: Array) -> tuple[float, float, float]:
     """Slope, its standard uncertainty, and scatter of phases about a straight line."""
-    centred = places - places.mean()
-    slope = float(centred @ phases / (centred @ centred))
-    rest = phases - phases.mean() - slope * centred
-    freedom = max(len(places) - 2, 1)
+    return _last_weight([np.ones_like(places), places - places.mean()], phases)
+
+
+def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
+    """Weight of the last column in a least-squares fit, its standard uncertainty, and the scatter."""
+    design = np.column_stack(columns)
+    weights, *_ = np.linalg.lstsq(design, values, rcond=None)
+    rest = values - design @ weights
+    freedom = max(len(values) - len(columns), 1)
     scatter = float(np.sqrt(rest @ rest / freedom))
-    error = _wider(freedom) * scatter * float(np.sqrt(_OVERLAP_VARIANCE / (centred @ centred)))
-    return slope, error, scatter
+    error = scatter * np.sqrt(_OVERLAP_VARIANCE * np.linalg.inv(design.T @ design)[-1, -1])
+    return float(weights[-1]), _wider(freedom) * float(error), scatter
 
 
 def _wider(freedom: int) -> float:

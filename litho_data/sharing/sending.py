@@ -64,7 +64,7 @@ def sent(content: Any, names: Mapping[int, str]) -> bytes:
 
 
 def received(content: bytes, objects: Mapping[str, Any]) -> Any:
-    """What was sent, with these objects in place of their names."""
+    """Replace the names in a sent job by these objects."""
     return _Receiver(BytesIO(content), objects).load()
 
 

@@ -12,7 +12,7 @@ from litho_data.foundation.errors import InputError
 
 
 class HasPrint(Protocol):
-    """What the draw needs of a scan: its id and its print."""
+    """The facts about a scan for the draw: its id and its print."""
 
     @property
     def id(self) -> str: ...

@@ -31,7 +31,7 @@ class ScanUnderTip(Record):
 
 
 class TipEstimate(RunFacts, Result):
-    """What scans say about the tip that made them.
+    """The tip as estimated from its scans.
 
     Args:
         kind: ``estimate`` if many places show the same end of the tip, else ``upper bound``.

@@ -274,10 +274,10 @@ def _settings(
 
 
 def _print_comparison(result: GapResult, out: Path) -> None:
-    from litho_design.judging.loaded import task_named
     from litho_design.reports.advice import called, named
+    from litho_design.tasks.task import registered_task
 
-    figure = task_named(result.task).headline[0]
+    figure = registered_task(result.task).headline[0]
     for judge in result.judges:
         found = [item for item in result.summary if (item.judge, item.figure) == (judge, figure)]
         told = ", ".join(f"{called(item.arm)} {item.judged_mean:.3f}" for item in found)

@@ -163,35 +163,42 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
 
 
 def _source(given: Any, pitch_um: float, level_height_um: float) -> _Source:
-    if isinstance(given, Element):
-        levels = given.levels()
-        return _Source(levels, given.layout, array_sha256(levels, "level", ("y", "x")))
-    if isinstance(given, LoadedDesign):
-        given = given.folder
-    if isinstance(given, str | Path) and Path(given).suffix == ".npy":
-        try:
-            given = np.load(given, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"array {given}", got=str(error), wanted="levels or heights in µm") from None
-    if isinstance(given, str | Path):
+    given = given.folder if isinstance(given, LoadedDesign) else given
+    in_file = isinstance(given, str | Path)
+    if in_file and Path(given).suffix != ".npy":
         record = Design.read(given)
         return _Source(layout_rows(given), record.layout, record.layout_sha256, Path(given), record)
-    if not isinstance(given, np.ndarray):
+    if isinstance(given, Element):
+        levels, layout = given.levels(), given.layout
+    else:
+        levels = _levels(_loaded(given) if in_file else given, level_height_um)
+        layout = LayoutSettings(
+            size_px=max(4, *levels.shape), pitch_um=pitch_um, cell_um=pitch_um,
+            levels=max(2, int(levels.max()) + 1), level_height_um=level_height_um,
+        )  # fmt: skip
+    return _Source(levels, layout, array_sha256(levels, "level", ("y", "x")))
+
+
+def _loaded(file: str | Path) -> Any:
+    try:
+        return np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"array {file}", got=str(error), wanted="levels or heights in µm") from None
+
+
+def _levels(array: Any, level_height_um: float) -> np.ndarray:
+    """Levels, uint8 (ny, nx), of an array of levels, or of heights in µm."""
+    if not isinstance(array, np.ndarray):
         wanted = "a design's folder, an Element, or an array of levels or heights in µm"
-        raise InputError("layout to export", got=type(given).__name__, wanted=wanted)
-    if given.ndim != 2 or not given.size or given.dtype.kind not in "buif" or not np.isfinite(given).all():
-        got = f"{given.dtype} of shape {given.shape}"
+        raise InputError("layout to export", got=type(array).__name__, wanted=wanted)
+    if array.ndim != 2 or not array.size or array.dtype.kind not in "buif" or not np.isfinite(array).all():
+        got = f"{array.dtype} of shape {array.shape}"
         raise InputError("array to export", got=got, wanted="finite levels or heights in µm (ny, nx)")
-    levels = np.rint(given / level_height_um) if given.dtype.kind == "f" else given
+    levels = np.rint(array / level_height_um) if array.dtype.kind == "f" else array
     if levels.min() < 0 or levels.max() > 255:
         got = f"levels from {levels.min():g} to {levels.max():g}"
         raise InputError("array to export", got=got, wanted="0 to 255", hint="another --level-height-um")
-    levels = np.ascontiguousarray(levels, np.uint8)
-    layout = LayoutSettings(
-        size_px=max(4, *levels.shape), pitch_um=pitch_um, cell_um=pitch_um,
-        levels=max(2, int(levels.max()) + 1), level_height_um=level_height_um,
-    )  # fmt: skip
-    return _Source(levels, layout, array_sha256(levels, "level", ("y", "x")))
+    return np.ascontiguousarray(levels, np.uint8)
 
 
 def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:

@@ -1,4 +1,4 @@
-"""What a print job needs besides the layout: format, base, slices and lines, stated once for all files."""
+"""Settings of a print job besides the layout: format, base, slices and lines."""
 
 from __future__ import annotations
 

@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
-from litho_data.commands.settings import changed, setting
-from litho_design.holograms.loss import HologramLoss
+from litho_data.commands.settings import setting
+from litho_data.foundation.results import Record
 from litho_design.optics import Optics
 from litho_design.optimisation.settings import (
     PAPER_SEARCH,
     DesignSettings,
     SearchSettings,
     Variant,
-    check_variant,
+    preset,
 )
 from litho_design.printers.layout import LayoutSettings
+
+
+class HologramLoss(Record):
+    """RMSE(target, image) + efficiency_weight * (1 - efficiency).
+
+    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; light
+    beyond them is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
+    doi:10.1364/OE.16.002176). ``scale`` matches the image to the target: ``paper`` divides by the mean over
+    the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is the share
+    of the incident power on pixels whose target is above zero.
+    """
+
+    scale: Literal["paper", "least-squares"] = setting(
+        "paper", "How the image is scaled to match the target", option="--loss-scale"
+    )
+    efficiency_weight: float = setting(
+        0.1, "Weight of the light that misses the target", option="--efficiency-weight", ge=0
+    )
+    signal_window_um: float = setting(
+        0.0, "Light further from the wanted light than this is free; 0 for none", unit="µm",
+        option="--signal-window-um", ge=0,
+    )  # fmt: skip
 
 
 class HologramSettings(DesignSettings):
@@ -44,12 +66,10 @@ def hologram_settings(
     Raises:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.
     """
-    given = dict(changes or {})
-    return changed(_preset(given.pop("variant", variant)), given)
+    return preset(_preset, variant, changes)
 
 
 def _preset(variant: Variant) -> HologramSettings:
-    check_variant(variant)
     if variant == "default":
         return HologramSettings()
     search = PAPER_SEARCH.model_copy(update={"learning_rate": 0.1})

@@ -144,15 +144,6 @@ class LoadedDesign:
         return torch.from_numpy(read_array(self.folder, name)).to(self.device)
 
 
-def task_named(name: str) -> type[Task]:
-    """The task of that name; importing this module registers holograms, lenses and reliefs.
-
-    Raises:
-        InputError: no such task.
-    """
-    return registered_task(name)
-
-
 def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> LoadedDesign:
     """The finished design in ``folder``, ready to be printed and scored on ``device``.
 

@@ -21,7 +21,7 @@ from litho_design.images.similarity import light_figures, likeness, matched_scal
 from litho_design.images.targets import ImagedObject, object_name
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import sensor_psf
-from litho_design.lenses.objects import object_stack, read_object
+from litho_design.lenses.objects import read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
@@ -193,19 +193,18 @@ def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
     """The object of a photograph, (n, n) in [0, 1], and its name or record."""
     settings = task.settings.imaging
     items = (*settings.objects, *settings.test_objects)
-    own = {object_name(item): item for item in items}
-    if imaged is None or (imaged not in own and not Path(imaged).is_file()):
-        raise unknown_name(
-            "photographed object", imaged or "no --camera-object", own, also="a picture's path"
-        )
-    if imaged in own:
-        if [object_name(item) for item in items].count(imaged) > 1:
+    names = [object_name(item) for item in items]
+    if imaged in names:
+        if names.count(imaged) > 1:
             raise InputError(
                 "photographed object",
                 got=f"{imaged!r}, which names two objects of the design",
                 wanted="the path of its picture, with a folder in front",
             )
-        stack = object_stack([own[imaged]], settings.object_px, task.pictures)
-        return stack[0].to(task.printer.device), own[imaged]
+        place = names.index(imaged)
+        return (*task.objects, *task.tested)[place], items[place]
+    if imaged is None or not Path(imaged).is_file():
+        given = imaged or "no --camera-object"
+        raise unknown_name("photographed object", given, names, also="a picture's path")
     pixels, record = read_object(Path(imaged), settings.object_px)
     return torch.from_numpy(pixels).to(task.printer.device), record

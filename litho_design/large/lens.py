@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from litho_design.large.bands import require_reach
 from litho_design.large.hologram import LIGHT, only
 from litho_design.lenses.bench import RadialLensBench
-from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import DirectLensTask, strip_rings
 from litho_design.optics import Optics
@@ -103,10 +102,6 @@ class RingLens(DirectLensTask):
         strip = rings[strip_rings(self.settings.layout, printer.halo_px, len(rings))]
         return printer.print_in_tiles(strip[None, None], self.tile_px)[0, 0].mean(0)
 
-    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
-        """Figures of the PSF of a print along the radius."""
-        return lens_score(self.bench, height_um)
-
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
         """Levels and heights along the radius."""
         levels = level.cpu().numpy().astype(np.uint8)
@@ -114,7 +109,4 @@ class RingLens(DirectLensTask):
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
         """Figures along the radius."""
-        return Findings(
-            reference_efficiency=self.reference_efficiency(height_um),
-            predicted=self.score(height_um).model_dump(),
-        )
+        return Findings(predicted=self.score(height_um).model_dump(), baselines=self.baselines())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,23 +18,34 @@ _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
 # Name among the inputs of a lens: (pictures, size, size), the design's pictures first.
-_PICTURES = "object_pictures"
+PICTURES = "object_pictures"
 
 
 def object_stack(
-    objects: Sequence[ImagedObject], size_px: int, pictures: Mapping[str, np.ndarray] | None = None
+    objects: Sequence[ImagedObject], size_px: int, pictures: Iterable[np.ndarray] = ()
 ) -> Tensor:
     """Objects (n, size, size) in [0, 1] with a dark border of one eighth.
 
     Args:
         objects: names of drawings, and records of pictures.
         size_px: side of the frame, sensor pixels.
-        pictures: float32 (size, size) in [0, 1] of each picture by the SHA-256 of its file.
+        pictures: float32 (size, size) in [0, 1] of each picture among the objects, in their order.
 
     Raises:
-        InputError: a picture whose pixels are not among ``pictures``, or have another size.
+        InputError: a picture whose pixels are missing, or have another size.
     """
-    return torch.stack([torch.from_numpy(_frame(item, size_px, pictures or {})) for item in objects])
+    border, brought, frames = size_px // _BORDER_SHARE, iter(pictures), []
+    for item in objects:
+        if isinstance(item, str):
+            frame: np.ndarray | None = np.pad(draw_target(item, size_px - 2 * border), border)
+        else:
+            frame = next(brought, None)
+        if frame is None or frame.shape != (size_px, size_px):
+            got = "no pixels" if frame is None else f"pixels of shape {frame.shape}"
+            wanted = f"its picture of {size_px} x {size_px} px"
+            raise InputError(f"object {object_name(item)}", got=got, wanted=wanted)
+        frames.append(torch.from_numpy(frame))
+    return torch.stack(frames)
 
 
 def with_objects(
@@ -62,13 +74,18 @@ def with_objects(
             wanted="the computational task",
             hint="or leave out --objects and --held-out-objects",
         )
-    imaging = settings.imaging
-    pictures: dict[str, np.ndarray] = {}
-    kept, tested = (_read_all(paths, imaging.object_px, pictures) for paths in (objects, held_out))
+    kept, tested = (
+        [read_object(file, settings.imaging.object_px) for place in paths for file in _files(Path(place))]
+        for paths in (objects, held_out)
+    )
     if objects and not held_out:
-        kept.sort(key=lambda item: (item.name, item.sha256))
+        kept.sort(key=lambda one: (one[1].name, one[1].sha256))
         count = max(_FEWEST_HELD_OUT, len(kept) // _HELD_OUT_SHARE)
         kept, tested = kept[:-count], kept[-count:]
+    for (pixels, record), (others, _) in itertools.combinations([*kept, *tested], 2):
+        if np.array_equal(pixels, others):
+            got = f"{record.name}, a picture that was given already"
+            raise InputError("objects", got=got, wanted="each picture once")
     if len(tested) < _FEWEST_HELD_OUT or (objects and not kept):
         raise InputError(
             "objects",
@@ -76,28 +93,15 @@ def with_objects(
             wanted=f"at least one for the design and {_FEWEST_HELD_OUT} held out",
             hint="give more pictures with --objects or --held-out-objects",
         )
-    update = {"test_objects": tuple(tested)} | ({"objects": tuple(kept)} if kept else {})
-    made = settings.model_copy(update={"imaging": imaging.model_copy(update=update)})
-    used = picture_records((*made.imaging.objects, *made.imaging.test_objects))
-    return made, {_PICTURES: np.stack([pictures[one.sha256] for one in used])}
-
-
-def pictures_of(objects: Sequence[ImagedObject], inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Pixels of the pictures among the objects of design and test, by the SHA-256 of their files."""
-    return {
-        one.sha256: pixels
-        for one, pixels in zip(picture_records(objects), inputs.get(_PICTURES, ()), strict=False)
-    }
-
-
-def picture_records(objects: Sequence[ImagedObject]) -> list[TargetRecord]:
-    """The pictures among ``objects``."""
-    return [item for item in objects if isinstance(item, TargetRecord)]
+    update = {"test_objects": tuple(record for _, record in tested)}
+    update |= {"objects": tuple(record for _, record in kept)} if kept else {}
+    made = settings.model_copy(update={"imaging": settings.imaging.model_copy(update=update)})
+    return made, {PICTURES: np.stack([pixels for pixels, _ in (*kept, *tested)])}
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
     """One sentence that names the objects if some are pictures; otherwise empty."""
-    if not picture_records((*objects, *held_out)):
+    if all(isinstance(item, str) for item in (*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))
     return [f"objects of the design: {kept}; held out: {tested}; their conversions are in the record"]
@@ -116,33 +120,6 @@ def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
     inner, notes = read_image(path, size_px - 2 * border, "object")
     notes += ["divided by its brightest value", f"dark border of {border} px"]
     return np.pad(inner, border), TargetRecord.of_file(path, notes)
-
-
-def _frame(item: ImagedObject, size_px: int, pictures: Mapping[str, np.ndarray]) -> np.ndarray:
-    if isinstance(item, str):
-        border = size_px // _BORDER_SHARE
-        return np.pad(draw_target(item, size_px - 2 * border), border)
-    pixels = pictures.get(item.sha256)
-    if pixels is None or pixels.shape != (size_px, size_px):
-        got = "no pixels" if pixels is None else f"pixels of shape {pixels.shape}"
-        raise InputError(f"object {item.name}", got=got, wanted=f"its picture of {size_px} x {size_px} px")
-    return pixels
-
-
-def _read_all(
-    paths: Sequence[str | Path], size_px: int, pictures: dict[str, np.ndarray]
-) -> list[TargetRecord]:
-    """Records of all pictures under ``paths``; their pixels are added to ``pictures``."""
-    records = []
-    for path in (file for place in paths for file in _files(Path(place))):
-        pixels, record = read_object(path, size_px)
-        if any(np.array_equal(pixels, other) for other in pictures.values()):
-            raise InputError(
-                "objects", got=f"{path}, a picture that was given already", wanted="each picture once"
-            )
-        pictures[record.sha256] = pixels
-        records.append(record)
-    return records
 
 
 def _files(place: Path) -> list[Path]:

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from litho_data.foundation.results import Record
 from litho_design.images.similarity import similarity
-from litho_design.lenses.bench import (
-    LensBench,
-    RadialLensBench,
-    record,
-    sensor_psf,
-)
-from litho_design.lenses.objects import object_stack
-from litho_design.lenses.settings import ImagingSettings, LensSettings
+from litho_design.lenses.bench import LensBench, RadialLensBench, record, sensor_psf
+from litho_design.lenses.settings import ImagingSettings
 from litho_design.optics.imaging import richardson_lucy
 
-# Figures of a lens that make sense even if nothing focuses.
-_OF_POWER = ("focusing_efficiency", "strehl", "cbr", "eff_window")
 _TEST_SEEDS = range(1000, 1003)
 
 
@@ -120,74 +111,49 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 
 @torch.no_grad()
 def imaging_score(
-    psf: Tensor,
-    design_psf: Tensor,
-    settings: ImagingSettings,
-    pictures: Mapping[str, np.ndarray] | None = None,
-) -> ImagingScore:
-    """Image the test objects through ``psf`` and reconstruct with both PSFs.
+    psf: Tensor, design_psf: Tensor, objects: Tensor, settings: ImagingSettings
+) -> dict[str, float]:
+    """Image objects (n, size, size) through ``psf`` and reconstruct with both PSFs: see ``ImagingScore``.
 
     Args:
         psf, design_psf: (window, window), share of the incident power per window pixel.
-        pictures: pixels of the test objects that are pictures, see ``object_stack``.
     """
-    real, expected = (sensor_psf(p, settings.pixel_px).float() for p in (psf, design_psf))
-    objects = object_stack(settings.test_objects, settings.object_px, pictures).to(psf.device)
-    rows: dict[str, list[float]] = {}
-
-    def add(name: str, estimates: Tensor) -> None:
-        for estimate, wanted in zip(estimates, objects, strict=True):
-            for figure, value in similarity(estimate, wanted, name).items():
-                rows.setdefault(figure, []).append(value)
-
+    real, expected = (sensor_psf(one, settings.pixel_px).float() for one in (psf, design_psf))
+    draws = []
     for seed in _TEST_SEEDS:
         seen = record(objects, real, settings, seed)
         scale = (seen * objects).sum((-2, -1)) / seen.square().sum((-2, -1))
-        add("direct", seen * scale[:, None, None])
-        add("design", richardson_lucy(seen, expected, settings.iterations))
-        add("calibrated", richardson_lucy(seen, real, settings.iterations))
-    figures = {name: sum(values) / len(values) for name, values in rows.items()}
-    figures |= {f"{name}_sd": float(torch.tensor(values).std()) for name, values in rows.items()}
-    return ImagingScore(**{name: figures[name] for name in ImagingScore.model_fields})
+        direct = seen * scale[:, None, None]
+        design, calibrated = (richardson_lucy(seen, one, settings.iterations) for one in (expected, real))
+        draws.append({"direct": direct, "design": design, "calibrated": calibrated})
+    values = _similarities(draws, objects)
+    spread = {f"{name}_sd": float(torch.tensor(found).std()) for name, found in values.items()}
+    return _of_images(_means(values) | spread)
+
+
+def black_images(objects: Tensor) -> dict[str, float]:
+    """The figures of images without light."""
+    black = dict.fromkeys(("direct", "design", "calibrated"), torch.zeros_like(objects))
+    return _of_images(_means(_similarities([black], objects)))
+
+
+def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
+    """Each figure of the images of all objects, by draw."""
+    rows: dict[str, list[float]] = {}
+    for name, images in (one for draw in draws for one in draw.items()):
+        for image, wanted in zip(images, objects, strict=True):
+            for figure, value in similarity(image, wanted, name).items():
+                rows.setdefault(figure, []).append(value)
+    return rows
+
+
+def _means(values: Mapping[str, list[float]]) -> dict[str, float]:
+    return {name: sum(found) / len(found) for name, found in values.items()}
+
+
+def _of_images(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: figures[name] for name in ImagingScore.model_fields if name in figures}
 
 
 class ImagingLensScore(LensScore, ImagingScore):
     """PSF and imaging figures of a computational lens."""
-
-
-@torch.no_grad()
-def score_lens(
-    settings: LensSettings,
-    bench: LensBench,
-    height_um: Tensor,
-    design_height_um: Tensor,
-    pictures: Mapping[str, np.ndarray] | None = None,
-) -> LensScore | ImagingLensScore:
-    """Figures of a printed lens whose design expected ``design_height_um``."""
-    score = lens_score(bench, height_um)
-    if settings.task == "direct":
-        return score
-    imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging, pictures)
-    return ImagingLensScore(**score.model_dump(), **imaging.model_dump())
-
-
-@torch.no_grad()
-def lens_baselines(
-    settings: LensSettings, bench: LensBench, pictures: Mapping[str, np.ndarray] | None = None
-) -> dict[str, dict[str, float]]:
-    """Scores of a perfect lens, a flat plate and, for a computational lens, black images, by name."""
-    ideal = bench.ideal_height_um()
-    flat = lens_score(bench, torch.zeros_like(ideal))
-    found = {
-        "perfect lens": score_lens(settings, bench, ideal, ideal, pictures).model_dump(),
-        "no lens": {name: getattr(flat, name) for name in _OF_POWER},
-    }
-    if settings.task == "computational":
-        imaging = settings.imaging
-        objects = object_stack(imaging.test_objects, imaging.object_px, pictures)
-        black: dict[str, float] = {}
-        for by in ("direct", "design", "calibrated"):
-            rows = [similarity(torch.zeros_like(wanted), wanted, by) for wanted in objects]
-            black |= {name: sum(one[name] for one in rows) / len(rows) for name in rows[0]}
-        found["black image"] = {name: black[name] for name in black if name in ImagingScore.model_fields}
-    return found

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 from pydantic import model_validator
 
-from litho_data.commands.settings import changed, setting
+from litho_data.commands.settings import setting
 from litho_data.foundation.results import Record
 from litho_design.images.targets import DrawnTarget, ImagedObject, object_name
 from litho_design.optics import Optics
@@ -18,7 +18,7 @@ from litho_design.optimisation.settings import (
     DesignSettings,
     SearchSettings,
     Variant,
-    check_variant,
+    preset,
 )
 from litho_design.printers.layout import LayoutSettings
 
@@ -127,12 +127,10 @@ def lens_settings(
     Raises:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.
     """
-    given = dict(changes or {})
-    return changed(_preset(given.pop("variant", variant)), {"task": task, **given})
+    return preset(_preset, variant, {"task": task, **(changes or {})})
 
 
 def _preset(variant: Variant) -> LensSettings:
-    check_variant(variant)
     default = LensSettings()
     if variant == "default":
         return default

@@ -20,13 +20,13 @@ from litho_design.lenses.bench import (
     record,
     sensor_psf,
 )
-from litho_design.lenses.objects import object_stack, pictures_note, pictures_of
+from litho_design.lenses.objects import PICTURES, object_stack, pictures_note
 from litho_design.lenses.score import (
     ImagingLensScore,
     LensScore,
-    lens_baselines,
+    black_images,
+    imaging_score,
     lens_score,
-    score_lens,
 )
 from litho_design.lenses.settings import SMOOTH_BELOW, LensSettings
 from litho_design.optics import Optics
@@ -36,6 +36,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
+# Figures that make sense even if nothing focuses.
+_OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
 # The same noise in every iteration, so that the search compares layouts, not noise; scores draw their own.
 _DESIGN_NOISE_SEED = 0
 _PLANE_NOTE = (
@@ -89,9 +91,9 @@ class LensTask(Task):
         _check(settings)
         imaging = settings.imaging
         objects = (*imaging.objects, *imaging.test_objects)
-        self.pictures = pictures_of(objects, inputs or {})
-        stack = object_stack(objects, imaging.object_px, self.pictures)
-        self.objects = stack[: len(imaging.objects)].to(printer.device)
+        pictures = (inputs or {}).get(PICTURES, ())
+        stack = object_stack(objects, imaging.object_px, pictures).to(printer.device)
+        self.objects, self.tested = stack[: len(imaging.objects)], stack[len(imaging.objects) :]
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
@@ -129,18 +131,15 @@ class LensTask(Task):
         self.cells.to(self.printer.device)
         return focusing_levels(phase, level_phase.cpu())
 
-    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore | ImagingLensScore:
-        """Score of a print whose design expected ``expected_um``, by default the same print."""
-        expected = height_um if expected_um is None else expected_um
-        return score_lens(self.settings, self.bench, height_um, expected, self.pictures)
-
-    def reference_efficiency(self, height_um: Tensor) -> float:
-        """Focusing efficiency of a perfect lens of this aperture, whatever the print."""
-        return lens_score(self.bench, self.bench.ideal_height_um()).focusing_efficiency
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
+        """Figures of the PSF of a print."""
+        return lens_score(self.bench, height_um)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores of a perfect lens, of no lens, and of black images on the same grid."""
-        return lens_baselines(self.settings, self.bench, self.pictures)
+        """Scores of a perfect lens and of a flat plate on the same grid."""
+        ideal = self.bench.ideal_height_um()
+        flat = lens_score(self.bench, torch.zeros_like(ideal)).model_dump(include=_OF_POWER)
+        return {"perfect lens": self.score(ideal).model_dump(), "no lens": flat}
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Strehl ratio and centre-to-background ratio."""
@@ -196,6 +195,17 @@ class ComputationalLensTask(LensTask):
         else:
             error = (estimate - self.objects).abs().mean()
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
+
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
+        """Also those of the images of test objects; ``expected_um`` is by default the print."""
+        with torch.no_grad():
+            psf, design_psf = (self.bench(height_um if one is None else one) for one in (None, expected_um))
+        tested = imaging_score(psf, design_psf, self.tested, self.settings.imaging)
+        return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
+
+    def baselines(self) -> dict[str, dict[str, float]]:
+        """Also the errors of black images."""
+        return super().baselines() | {"black image": black_images(self.tested)}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:

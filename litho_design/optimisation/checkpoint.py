@@ -31,7 +31,7 @@ _DAMAGED = (
 
 @dataclass
 class SearchState:
-    """What a search has found so far: all that resuming needs besides its settings and stateful parts."""
+    """The state of a search, from which it resumes together with its settings and stateful parts."""
 
     iteration: int = 0
     best_loss: float = math.inf

@@ -1,4 +1,4 @@
-"""Process window: random prints and optics that differ from the model."""
+"""Process window: random prints and optics that differ from the model, and models that differ."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ _NARROWEST_BLUR_PX = 0.2
 # keeps this share of it, and no error grows by more than the inverse.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
+# (1e-6 µm)^2, far below any height, keeps the root differentiable where all models agree.
+_SMALLEST_VARIANCE_UM2 = 1e-12
 _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um")
 
 
@@ -36,7 +38,9 @@ class ProcessWindow(Record):
     microscope.
     """
 
-    FORMER: ClassVar[frozenset[str]] = frozenset({"risk", "weight", "pass_drop_db", "pass_share", "stitch"})
+    FORMER: ClassVar[frozenset[str]] = frozenset(
+        {"risk", "weight", "pass_drop_db", "pass_share", "stitch", "roughness"}
+    )
 
     gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0, le=1)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
@@ -189,6 +193,22 @@ def risk(losses: Tensor, tail: float) -> Tensor:
     """The mean of the worst share of many losses."""
     worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
+
+
+def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
+    """RMS over the area of the standard deviation among models, µm; differentiable.
+
+    A constant height is only a constant phase, so the mean of every print is subtracted first.
+
+    Args:
+        heights_um: prints of one layout by k models, (k, ...).
+        area: area that each height covers, (...), in any unit, for rings; None for pixels.
+    """
+    flat = heights_um.flatten(1)
+    share = flat[0].new_ones(flat[0].shape) if area is None else area.flatten()
+    share = share / share.sum()
+    free = flat - (flat * share).sum(1, keepdim=True)
+    return ((free.var(0, correction=0) * share).sum() + _SMALLEST_VARIANCE_UM2).sqrt()
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:

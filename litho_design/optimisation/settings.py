@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, get_args
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from litho_data.commands.settings import changed, setting
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
 from litho_design.optics import Optics
-from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.printers.layout import LayoutSettings
 
 # Smallest fall of a loss that counts as progress.
 PROGRESS = 1e-4
 
+S = TypeVar("S", bound="DesignSettings")
 Variant = Literal["default", "paper", "authors"]
 StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 
 class SearchSettings(Record):
-    """How the layout is searched; every choice that the paper leaves open is a recorded setting."""
+    """Settings of the search, including every choice that the paper leaves open."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"start_iterations", "start_jitter_levels", "hard_from"})
 
@@ -93,6 +93,17 @@ class EnsemblePenalty(Record):
     )
 
 
+class Fabrication(Record):
+    """A penalty on a layout in addition to the loss of its light: inside_weight * ``outside``."""
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
+
+    inside_weight: float = setting(
+        0.0, "Weight of levels and steps that the model's training layouts hardly have",
+        option="--inside-weight", ge=0,
+    )  # fmt: skip
+
+
 class DesignSettings(Record):
     """The settings that every design has."""
 
@@ -120,10 +131,13 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
     return changed(DesignSettings(), dict(changes or {}))
 
 
-def check_variant(variant: str) -> None:
-    """Refuse a preset that does not exist.
+def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[str, Any] | None = None) -> S:
+    """Settings of a preset with changes by path; a ``variant`` among them replaces the given one.
 
     Raises:
-        InputError: no such preset.
+        InputError: no such preset, or what ``changed`` refuses.
     """
+    given = dict(changes or {})
+    variant = given.pop("variant", variant)
     require_known("variant", variant, get_args(Variant))
+    return changed(presets(variant), given)

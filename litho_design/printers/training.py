@@ -1,4 +1,4 @@
-"""Compare the levels and steps of a layout with those of a model's training layouts."""
+"""Compare a layout with a model's training layouts: distance, penalty, and the model's own error."""
 
 from __future__ import annotations
 
@@ -68,6 +68,32 @@ def out_of_distribution(
         step_distance=apart,
         unusual=unusual,
     )
+
+
+def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
+    """The excess of a layout over twice the tails of a model's training layouts, in levels.
+
+    For every k, three shares are compared: of pixels at level k or lower, of pixels at k or higher, and of
+    neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
+    training layouts; 0 if the card has none. A sum of tails, unlike a sum of shares, also attracts a pixel
+    that is several levels outside.
+    """
+    total = level.new_zeros(())
+    trained, trained_steps = (
+        training_share(card, name, levels) for name in ("training_level_share", "training_step_share")
+    )
+    for place in range(1, levels):
+        if trained is not None:
+            higher = (level - (place - 1)).clamp(0, 1).mean()
+            limit = float(trained[place:].sum())
+            total = total + (higher - ALLOWED_TIMES * limit).clamp(min=0)
+            total = total + (1 - higher - ALLOWED_TIMES * (1 - limit)).clamp(min=0)
+        if trained_steps is not None:
+            limit = ALLOWED_TIMES * float(trained_steps[place:].sum())
+            down, right = (level.diff(dim=axis).abs() for axis in (-2, -1))
+            larger = [(step - (place - 1)).clamp(0, 1).mean() for step in (down, right)]
+            total = total + ((larger[0] + larger[1]) / 2 - limit).clamp(min=0)
+    return total
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:

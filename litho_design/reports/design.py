@@ -154,14 +154,10 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
             f"cells reaches {ceiling:.4f} ({100 * (design.polished_loss / ceiling - 1):+.1f} % against it)."
         )
     if reference := design.reference_efficiency:
-        lens = isinstance(task, LensTask)
-        reached = design.predicted["focusing_efficiency" if lens else "eff_signal"] / reference
-        what = (
-            f"A perfect lens of this aperture puts {100 * reference:.1f} % within the same radius"
-            if lens
-            else f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal"
+        page.paragraph(
+            f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal; the "
+            f"print reaches {design.predicted['eff_signal'] / reference:.2f} of that."
         )
-        page.paragraph(f"{what}; the print reaches {reached:.2f} of that.")
 
 
 def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:

@@ -11,12 +11,12 @@ import numpy as np
 from litho_data.reports.page import Page, capitalised
 from litho_design.holograms.bench import HologramScore
 from litho_design.judging.gap import GapResult, GapSummary, PairedDifference, design_folder
-from litho_design.judging.loaded import task_named
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.reports.advice import WORDS, baseline_line, called, named
 from litho_design.reports.pictures import Panel, panels_figure
 from litho_design.reports.tables import meanings
 from litho_design.tasks.design import Design
+from litho_design.tasks.task import registered_task
 
 # With fewer seeds, an interval over them is missing or meaningless.
 _FEWEST_SEEDS = 3
@@ -39,7 +39,7 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
         words=WORDS,
     )
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
-    shown = task_named(result.task).headline or tuple(own.predicted)
+    shown = registered_task(result.task).headline or tuple(own.predicted)
     page.verdict(_verdict(result, shown[0]))
     page.figure(
         panels_figure(pictures),
@@ -92,7 +92,7 @@ def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
 def _verdict(result: GapResult, figure: str) -> str:
     """The best arm under each judge that is no arm, or else under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
-    sign = 1 if figure in task_named(result.task).errors else -1
+    sign = 1 if figure in registered_task(result.task).errors else -1
     unit = " dB" if figure.endswith("_db") else ""
     told = []
     for judge in judges:
@@ -123,7 +123,7 @@ def _chance(pair: PairedDifference, seeds: int) -> str:
 
 
 def _caption(task: str, figure: str) -> str:
-    better = "less" if figure in task_named(task).errors else "more"
+    better = "less" if figure in registered_task(task).errors else "more"
     return f"{capitalised(_label(figure))}: mean over seeds [95 % interval]; {better} is better."
 
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from litho_data.reports.page import Page
-from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import Judgement, ScoreResult
 from litho_design.reports.advice import WORDS, called, headline, spread_sentence
 from litho_design.reports.pictures import Panel, panels_figure
 from litho_design.reports.tables import meanings, score_table
+from litho_design.tasks.task import registered_task
 
 
 def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) -> Path:
@@ -46,7 +46,7 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
         columns[name] = score.figures
         if score.uncertainty is not None:
             columns[f"± {score.judge.name}"] = score.uncertainty
-    labels = meanings(task_named(result.task).score_type) | meanings(LensPhotoScore)
+    labels = meanings(registered_task(result.task).score_type) | meanings(LensPhotoScore)
     page.table(
         score_table(columns | (result.baselines or {}), labels),
         "Figures by judge, ± one standard deviation, and their baselines",
@@ -83,7 +83,7 @@ def _verdict(result: ScoreResult) -> str:
 
 def _spread(result: ScoreResult) -> str:
     """The design's own figure beside those of its judging models; empty with fewer than two models."""
-    task = task_named(result.task)
+    task = registered_task(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
     judged = {one.judge.name: one.figures.get(figure) for one in result.scores if one.kind == "model"}
     by_model = {result.designed_with.name: result.designed.get(figure)} | judged

@@ -124,10 +124,10 @@ def _write_report(folder: Path, result: ReadSheet) -> None:
         {"model": "the same, with what the loop found", "mae_nm": result.corrected_nm},
     ]
     page.table(
-        errors, "mean absolute error, one offset per scan free; scans held out of the fits", "errors.csv"
+        errors, "Mean absolute error, one offset per scan free; scans held out of the fits", "errors.csv"
     )
     found = ", ".join(result.found) or "nothing"
-    page.paragraph(f"The loop adds {found}; its verdict: {result.verdict}.")
+    page.paragraph(f"The loop adds {found}; its verdict: {result.verdict.replace('-', ' ')}.")
     page.links(
         [
             ("prints-report/report.html", "Report of the dataset"),

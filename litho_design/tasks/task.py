@@ -18,15 +18,13 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
-from litho_design.optimisation.disagreement import disagreement_um
-from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.parameters import CellMap, Parametrisation, make_parametrisation
 from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.process_window import Draw, check_draws, draws, risk
+from litho_design.optimisation.process_window import Draw, check_draws, disagreement_um, draws, risk
 from litho_design.optimisation.ranks import ALONE
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import Printer
-from litho_design.printers.training import out_of_distribution
+from litho_design.printers.training import out_of_distribution, outside
 from litho_design.tasks.bench import ViewsBench
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -44,7 +42,7 @@ class Figures(Record):
 
 
 class Task:
-    """What is wanted behind an element, ready to be optimised and scored through printers.
+    """A goal for the light behind an element, which can be optimised and scored through printers.
 
     For a task of your own, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``,
     and pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report

@@ -26,7 +26,7 @@ from litho_design.judging.gap import (
     paired_differences,
     summarise,
 )
-from litho_design.judging.loaded import load_design, task_named
+from litho_design.judging.loaded import load_design
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import lens_task
@@ -119,12 +119,13 @@ def compare(
     with growing_folder(folder, GapResult.FILE_NAME, holds=DESIGNS):
         done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
         designs = [design for _, design in progress(done, "designs", len(jobs))]
-        judged = {
-            (arm, seed): _judged(design_folder(folder, arm, seed), arm, seed, everyone)
-            for arm, seed in itertools.product(designers, every_seed)
-        }
-        entries = [entry for found, _ in judged.values() for entry in found]
-        shown = task_named(designs[0].task).headline
+        entries: list[GapEntry] = []
+        pictures: list[list[Panel]] = []
+        for arm, seed in itertools.product(designers, every_seed):
+            found, panels = _judged(design_folder(folder, arm, seed), arm, seed, everyone)
+            entries += found
+            pictures += [panels] if seed == every_seed[0] else []
+        shown = registered_task(designs[0].task).headline
         result = GapResult(
             task=designs[0].task,
             **run_facts(),
@@ -137,7 +138,7 @@ def compare(
             summary=summarise(entries),
             paired=paired_differences(entries, shown or tuple(designs[0].predicted)),
         )
-        write_gap_report(folder, result, [judged[arm, every_seed[0]][1] for arm in designers])
+        write_gap_report(folder, result, pictures)
         result.write(folder)
     return result
 

@@ -38,7 +38,7 @@ S = TypeVar("S", bound=DesignSettings)
 
 
 class How(TypedDict, total=False):
-    """What every design takes.
+    """Arguments of every design.
 
     Attributes:
         judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;

@@ -150,7 +150,7 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
 
 
 def lock_box_text(split: ScoredSplit) -> str:
-    """What was done with the locked scans of the dataset."""
+    """Describe the treatment of the locked scans of the dataset."""
     if not split.lock_box:
         return "The dataset is too small for locked scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]

@@ -1,42 +1,30 @@
-"""Several processes that share one training, started by ``torchrun``; without it there is one."""
+"""The processes of ``torchrun``, which share a training; without it there is one."""
 
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 from torch import distributed as dist
 
 
-@contextmanager
-def processes_of_torchrun() -> Iterator[bool]:
-    """Join the other processes, if ``torchrun`` started any; yields whether this is the first."""
-    started = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if started:
-        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    try:
-        yield rank_and_count()[0] == 0
-    finally:
-        if started:
-            dist.destroy_process_group()
+def joined() -> tuple[int, int]:
+    """Join the processes of torchrun, over gloo for processors and NCCL for GPUs, each with its own GPU.
 
-
-def rank_and_count() -> tuple[int, int]:
-    """Number of this process, from 0, and how many there are."""
-    return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
-
-
-def own_device() -> torch.device:
-    """A GPU of its own for each process of a machine, if there is one."""
-    if not torch.cuda.is_available():
-        return torch.device("cpu")
-    torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-    return torch.device("cuda", torch.cuda.current_device())
+    Returns:
+        the number of this process, from 0, and how many there are.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return 0, 1
+    if not dist.is_initialized():
+        if torch.cuda.is_available():
+            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        dist.init_process_group()
+    return dist.get_rank(), dist.get_world_size()
 
 
 def add_over_processes(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over the processes; they must come in one order."""
-    if rank_and_count()[1] > 1:
+    """Replace each tensor by its sum over the processes, which must give them in one order."""
+    if joined()[1] > 1:
         for tensor in tensors:
             dist.all_reduce(tensor)

@@ -20,7 +20,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
-from litho_models.fitting.processes import processes_of_torchrun
+from litho_models.fitting.processes import joined
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.models import model_class
@@ -87,10 +87,8 @@ def train(
         "config": config.model_dump(mode="json"),
         "lock_box": locked,
     }
-    with (
-        processes_of_torchrun() as first,
-        growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext(),
-    ):
+    first = joined()[0] == 0
+    with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
         if first:
             say(f"training {model} on {len(used)} scans")
         fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)

@@ -24,7 +24,7 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
-from litho_models.fitting.processes import add_over_processes, own_device, rank_and_count
+from litho_models.fitting.processes import add_over_processes, joined
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
@@ -51,7 +51,7 @@ def train_network(
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
-    device = own_device()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     warn_where_slower(_precision(config), device.type)
     model.to(device)
     state = TrainingState(model, _optimiser(model, config))
@@ -85,7 +85,7 @@ def train_network(
         if not HEIGHT_UM.holds([one / NM_PER_UM for one in errors_nm]):
             raise _diverged(model, last)
         state.record(record)
-        if checkpoints is not None and rank_and_count()[0] == 0:
+        if checkpoints is not None and joined()[0] == 0:
             checkpoints.save(state)
     state.restore_best()
     return state.history
@@ -138,7 +138,7 @@ def _step(
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
-    rank, count = rank_and_count()
+    rank, count = joined()
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)

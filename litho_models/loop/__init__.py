@@ -1,1 +1,1 @@
-"""From the residual of a model on measured prints to causes, laws and a corrected model."""
+"""Find causes and laws in the residual of a model on measured prints, and correct the model."""

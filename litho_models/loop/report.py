@@ -56,7 +56,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     )
     page.heading("All errors")
     page.table(
-        [row.model_dump(exclude={"by_scan_nm"}) for row in result.errors],
+        [row.model_dump(exclude={"by_scan_nm", "edge_by_scan_nm"}) for row in result.errors],
         "Each row says which terms it has. Rows of one column are made alike.",
         "errors.csv",
     )

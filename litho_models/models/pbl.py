@@ -186,7 +186,7 @@ class Pbl(Simulator):
         return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
-        """What the paper's chain makes of a field with nothing beyond its edge, or of its interior alone."""
+        """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
         optical, diffusion = self._radii_px()
         initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
         dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)

@@ -59,7 +59,7 @@ class PrintValues(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How the values of unchanged prints vary.
+    """The variation of unchanged prints.
 
     Attributes:
         mean: over the prints; ``sd``: between them, with its 95 % interval.

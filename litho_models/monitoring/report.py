@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.reports.page import Page
-from litho_data.reports.pictures import new_figure
+from litho_data.reports.pictures import LIGHT, new_figure
 from litho_models.monitoring.prints import WATCHED, Check, FigureCheck, print_values
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.table(
         result.figures,
         "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed, whichever print "
-        f"is the first; alarm if at most alarm_at, the figure's share of {result.false_alarm_rate:g}.",
+        f"is the first; alarm if at most “alarm at”, the figure's share of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
         columns=_COLUMNS,
@@ -56,8 +56,8 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
     watched = WATCHED[one.name]
     start = 0
     for rows, colour, label in (
-        (result.reference_scans, "#5b6675", "reference"),
-        (result.new_scans, "#0b6aa2", "new"),
+        (result.reference_scans, LIGHT["soft"], "reference"),
+        (result.new_scans, LIGHT["accent"], "new"),
     ):
         prints = print_values(rows, watched)
         place = np.arange(start, start + len(prints.values))
@@ -69,11 +69,11 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
             axes.axvspan(since - 0.5, place[-1] + 0.5, color="#c23b22", alpha=0.12, label="changed")
         start = place[-1] + 1
     spread = 100 * one.spread
-    axes.axhline(0, color="#1c2430", lw=0.8)
+    axes.axhline(0, color=LIGHT["ink"], lw=0.8)
     axes.axhspan(-spread, spread, color="#9aa7b5", alpha=0.25, label="spread of the reference")
     for sign in (-1, 1):
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
-    axes.axvline(one.reference_prints - 0.5, color="#1c2430", lw=0.8, ls=":")
+    axes.axvline(one.reference_prints - 0.5, color=LIGHT["ink"], lw=0.8, ls=":")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="print, in printing order", ylabel="against the reference, %")
     axes.set_title(watched.words, fontsize=10)

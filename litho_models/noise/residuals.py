@@ -1,4 +1,4 @@
-"""What a model leaves of the scans of a store: from a benchmark's cache (out of fold) or a frozen model."""
+"""Residuals of a model on the scans of a store, from a benchmark's cache (out of fold) or a frozen model."""
 
 from collections.abc import Sequence
 from pathlib import Path

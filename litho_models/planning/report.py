@@ -84,7 +84,7 @@ def _verdict(plan: NextPrint) -> str:
     wanting = f" A fact in the card, not a print, answers {facts}." if facts else ""
     return (
         f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
-        f"{len(asked)} questions are asked.{wanting}"
+        f"Questions asked: {len(asked)}.{wanting}"
     )
 
 

@@ -171,8 +171,8 @@ class Products:
     def freed_of(self, blocks: Sequence[Block]) -> Products:
         """Project these blocks, fitted to all scans, out of the residual and the other columns.
 
-        The columns of the blocks become zero. Later fits of common strengths equal a joint fit. Strengths by
-        group do so only if the projected part is the same in all groups.
+        The columns of the blocks become zero. Later fits of common strengths equal a joint fit. Later fits of
+        strengths by group equal a joint fit only if the projected part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)

@@ -25,11 +25,11 @@ _CANDIDATES = 8
 # Half the longest piece of a contour, the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
-    f"ssim has a Gaussian window of {SSIM_SIGMA_PX:g} px, {SSIM_WINDOW_PX} px wide, and a data range of "
+    f"SSIM has a Gaussian window of {SSIM_SIGMA_PX:g} px, {SSIM_WINDOW_PX} px wide, and a data range of "
     f"{SSIM_RANGE_UM:g} µm."
 )
 EDGES_TEXT = (
-    "edge_mean and edge_p95 are distances of the measured contours from the predicted ones at the heights "
+    "Edge shifts are distances of the measured contours from the predicted ones at the heights "
     f"half way between nominal levels, over the pieces whose partner lies within {SEARCH_UM:g} µm (of a "
     f"film: at half its height, within {FILM_SEARCH_PX:g} px); the counts are pieces of the "
     "measured contours with and without a partner, and of the predicted contours without one."

@@ -21,7 +21,7 @@ QUADRANTS = (0, 1, 2, 3)
 
 
 class Split(Record):
-    """How a dataset was divided; ``lock_box``: its locked scans, scored or not."""
+    """The division of a dataset; ``lock_box``: its locked scans, scored or not."""
 
     kind: str
     folds: int = 0
@@ -29,7 +29,7 @@ class Split(Record):
 
 
 class ScoredSplit(Split):
-    """Which scans were scored; ``lock_box_opened``: whether any locked one was.
+    """The scored scans; ``lock_box_opened``: whether any locked scan was scored.
 
     ``first_folds``: how many of the folds were made; None for all.
     """

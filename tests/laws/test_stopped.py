@@ -23,6 +23,8 @@ from tests.stopped_commands import COMMANDS
 ROOT = Path(__file__).parents[2]
 # One of each way to write a folder: a store, parts that grow, a whole folder, a plan from kept tiles, a file.
 QUICK = ("build", "train-network", "freeze", "next-print", "export-design")
+# So short that they are stopped after each of their writes here too.
+EVERY = {"freeze", "export-design"}
 # One file, or a folder whose parts are those of other commands.
 ELSEWHERE = {"level", "predict", "sheet-read"}
 
@@ -50,6 +52,7 @@ def _commands(group: click.Command, before: str = "") -> Iterator[tuple[str, cli
 def test_a_stopped_command_that_is_given_again_ends_like_one_that_was_not(name: str, tmp_path: Path) -> None:
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     words = [sys.executable, "-m", "tests.stopped_commands", name, str(tmp_path / "place")]
+    words += ["every"] if name in EVERY else []
     done = subprocess.run(words, cwd=ROOT, env=one_thread, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "all equal" in done.stdout

@@ -112,7 +112,7 @@ def test_a_symmetric_layout_is_taken_upright_with_a_warning():
     warp = warp_about_centre(SHAPE, margin_px=MARGIN_PX, shift_px=(2.0, 1.0))
     found = register(scan_of(layout, warp, SCAN_SHAPE, snr=5), layout)
     assert found.quality.dihedral == "identity"
-    assert "alike in another orientation" in found.quality.warning
+    assert "looks the same in another orientation" in found.quality.warning
 
 
 def test_a_foreign_scan_fails_on_its_correlation():

@@ -7,8 +7,8 @@ import pytest
 
 from litho_data.foundation.errors import InputError
 from litho_design.judging.gap import GapResult, interval95, paired_differences, summarise
-from litho_design.judging.loaded import task_named
 from litho_design.printers.printer import Printer
+from litho_design.tasks.task import registered_task
 from litho_design.workflows.compare import compare
 
 
@@ -40,7 +40,7 @@ def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
     paired = {(p.judge, p.figure): p for p in result.paired}
     assert paired["fab", "si_psnr_db"].mean == pytest.approx(figures["blur", "fab"] - figures["none", "fab"])
     assert summarise(result.entries) == result.summary
-    assert paired_differences(result.entries, task_named("hoe").headline) == result.paired
+    assert paired_differences(result.entries, registered_task("hoe").headline) == result.paired
     assert GapResult.read(tmp_path) == result
     written = (tmp_path / "designs" / "blur" / "seed1" / "design.json").stat().st_mtime_ns
     compare(settings, arms, tmp_path, judges=judges, target="ring", seeds=(0, 1), announce=False)

@@ -13,8 +13,8 @@ from litho_design.images.targets import load_target
 from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.settings import LensView, lens_settings
 from litho_design.optics import Optics
-from litho_design.optimisation.disagreement import disagreement_um
 from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.process_window import disagreement_um
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, Design

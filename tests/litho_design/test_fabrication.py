@@ -11,9 +11,8 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings
-from litho_design.optimisation.fabrication import outside
 from litho_design.printers.layout import LayoutSettings
-from litho_design.printers.training import out_of_distribution
+from litho_design.printers.training import out_of_distribution, outside
 from litho_design.reports.advice import distribution_warning, stroke_advice
 from litho_design.tasks.design import LEVELS_FILE
 

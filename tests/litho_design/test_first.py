@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, first, hologram_settings
 from litho_design.images.targets import load_target, stroke_width_px
 from litho_design.judging.gap import GapResult
-from litho_design.judging.loaded import task_named
+from litho_design.tasks.task import registered_task
 from litho_design.workflows.first import small_hologram
 from tests.tables import require_tables_equal_record
 
@@ -34,7 +34,7 @@ def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_pa
         if entry.judge == "pbl":
             assert f"{entry.judged['si_psnr_db']:.3f}" in page
     assert page.count("<img") == 1
-    matrices = {f"matrix_{figure}.csv": figure for figure in task_named("hoe").headline}
+    matrices = {f"matrix_{figure}.csv": figure for figure in registered_task("hoe").headline}
     ends = {"paired.csv": {"95 % from": "", "to": ""}}
     require_tables_equal_record(tmp_path, GapResult.FILE_NAME, ends, pivoted=[*matrices])
     for table, figure in matrices.items():

@@ -17,7 +17,7 @@ from litho_data.foundation.run_facts import run_facts
 from litho_design import design_hologram, hologram_settings, score
 from litho_design.cli.app import app, main
 from litho_design.printers.layout import LayoutSettings
-from litho_design.printers.source import JUDGES, load_printer, models_at_hand
+from litho_design.printers.source import JUDGES, load_printer, load_printers, models_at_hand
 from litho_design.printers.training import OutOfDistribution
 from litho_design.reports.advice import distribution_warning, spread_sentence, stroke_advice
 from litho_design.tasks.design import Design
@@ -151,6 +151,17 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert gap["schema"] == "litho-design/gap/1"
     assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
     assert {record.run.commit, judged["commit"], gap["commit"]} == {run_facts()["commit"]}
+
+
+def test_printers_are_given_as_words_or_as_they_are(make_printer):
+    layout = LayoutSettings(size_px=16)
+    own = make_printer(layout, name="own")
+    found = load_printers(["none", " flat=none ", own], layout)
+    assert [*found] == ["none", "flat", "own"]
+    assert found["own"] is own
+    for words, message in (([" "], "wanted none, MODEL or NAME"), (["none", "none"], "'none' twice")):
+        with pytest.raises(InputError, match=message):
+            load_printers(words, layout)
 
 
 def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeypatch):

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture
-from litho_design.holograms.loss import HologramLoss, hologram_loss
+from litho_design.holograms.loss import hologram_loss
+from litho_design.holograms.settings import HologramLoss
 from litho_design.images.similarity import (
     SSIM_WINDOW_PX,
     light_figures,

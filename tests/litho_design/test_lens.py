@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_design.images.targets import draw_target
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import CENTRE_UM, LensBench, RadialLensBench, centre_to_background, sensor_psf
-from litho_design.lenses.score import half_maximum_width_um, lens_score, score_lens
+from litho_design.lenses.score import half_maximum_width_um, lens_score
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, blaze_efficiency
@@ -125,14 +125,14 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
     assert printer.tiling_check(level, tile_px=64) is None
 
 
-def test_errors_of_a_computational_lens_by_independent_code(settings):
+def test_errors_of_a_computational_lens_by_independent_code(settings, make_printer):
     """Print, PSF, sensor image and Richardson-Lucy once more, in NumPy and SciPy and float64."""
     computational = settings.model_copy(update={"task": "computational"})
     imaging, n, window, z, wavelength = computational.imaging, 300, 128, 100.0, 0.6328
     bench = LensBench(LAYOUT, OPTICS, settings.view)
     rough = torch.randn(n, n, generator=torch.Generator().manual_seed(0)) * 0.1
     heights = [bench.ideal_height_um() + part * rough for part in (1.0, 0.5)]
-    found = score_lens(computational, bench, heights[0], heights[1])
+    found = lens_task(computational, make_printer(LAYOUT)).score(*heights)
 
     # First Rayleigh-Sommerfeld integral, summed directly over the aperture.
     x = (np.arange(n) - (n - 1) / 2) * 0.1

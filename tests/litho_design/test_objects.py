@@ -14,7 +14,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.images.targets import draw_target, object_name
 from litho_design.judging.gap import GapResult
-from litho_design.lenses.objects import object_stack, picture_records, pictures_of, read_object, with_objects
+from litho_design.lenses.objects import PICTURES, object_stack, read_object, with_objects
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import LensTask, lens_task
 from litho_design.optics import Optics
@@ -60,8 +60,7 @@ def folder(tmp_path):
 
 def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
     brought, inputs = with_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
-    (record,) = picture_records(("ring", *brought.imaging.objects))
-    ring, picture = object_stack(("ring", record), 32, pictures_of([record], inputs))
+    ring, picture = object_stack(("ring", *brought.imaging.objects), 32, inputs[PICTURES])
     inside = slice(4, 28)
     assert torch.equal(ring[inside, inside], torch.from_numpy(draw_target("ring", 24)))
     grey = cv2.imread(str(folder / "a.png"), cv2.IMREAD_GRAYSCALE).astype(np.float32)
@@ -87,16 +86,15 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
         "24 px; divided by its brightest value; dark border of 4 px"
     )
     assert deep.adaptation == "divided by its brightest value; dark border of 4 px"
-    pictures = pictures_of([wide, deep], inputs)
-    seen = pictures[wide.sha256]
+    seen, dark = inputs[PICTURES]
     assert seen.shape == (32, 32)
     # 12 of the 24 rows are light: full on the left, half on the right. Luma is 59.8 against 29.9, and a
     # decoder may round or cut its counts: one in 59.
     assert np.allclose(seen[10:22, 4:16], 1)
     assert np.allclose(seen[10:22, 16:28], 0.5, atol=1 / 59)
     assert seen.sum() == pytest.approx(seen[10:22, 4:28].sum())
-    assert pictures[deep.sha256][4, 4] == 1
-    assert np.allclose(pictures[deep.sha256][10:20, 10:20], 0.1)
+    assert dark[4, 4] == 1
+    assert np.allclose(dark[10:20, 10:20], 0.1)
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(3, 2), (5, 2), (8, 2), (12, 3)])

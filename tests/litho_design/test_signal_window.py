@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from litho_design import design_hologram, hologram_settings
-from litho_design.holograms.loss import HologramLoss, counted_pixels, hologram_loss
+from litho_design.holograms.loss import counted_pixels, hologram_loss
+from litho_design.holograms.settings import HologramLoss
 
 TINY = {
     "layout.size_px": 48,

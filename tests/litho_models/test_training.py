@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_models.fitting import TrainingConfig, fit, fit_with_record
+from litho_models.fitting import TrainingConfig, fit, fit_with_record, small_models
 from litho_models.fitting import stochastic as network
 from litho_models.fitting.checkpoint import CheckpointFolder, TrainingState
 from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
@@ -397,7 +397,7 @@ def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
     def of_process(rank, count):
         """What one process adds to the sum over processes."""
         added = []
-        monkeypatch.setattr(network, "rank_and_count", lambda: (rank, count))
+        monkeypatch.setattr(network, "joined", lambda: (rank, count))
         monkeypatch.setattr(
             network, "add_over_processes", lambda own: added.extend(one.clone() for one in own)
         )
@@ -437,6 +437,14 @@ def test_several_processes_give_the_loss_curve_of_one(count, tmp_path):
     for a, b, near in zip(one, many, (1e-4, 1e-4, 2e-2), strict=True):
         assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=near)
         assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=near)
+
+
+def test_the_windows_of_four_scans_lie_in_their_four_corners(monkeypatch):
+    monkeypatch.setattr(small_models, "WINDOW_PX", 16)
+    whole = make_scan(0, size_px=40)
+    part = {name: getattr(whole, name)[:24] for name in ("mask_level", "height_um", "valid")}
+    windows = [small_models._Sample(replace(whole, **part), number)._window for number in range(4)]
+    assert [(one.y, one.x, one.size_px) for one in windows] == [(y, x, 16) for y in (0, 8) for x in (0, 24)]
 
 
 @pytest.mark.parametrize(("name", "rate"), [("pbl", 1e6), ("fno", 1e3), ("fno", 1e9), ("physics", 1e8)])
