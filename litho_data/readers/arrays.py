@@ -86,7 +86,7 @@ def array_channel(
     """Make the channel of a two-dimensional array, which is [y, x] unless the names of its dimensions differ.
 
     ``raw`` reads its values; ``around`` contains the attributes beside and above it. x grows to the right.
-    Rows keep the order of the file, even if their coordinate falls.
+    Rows keep the order of the file, even if their coordinate decreases.
 
     Raises:
         InputError: attributes that change the values in an unknown way, which the message names; values that

@@ -194,7 +194,7 @@ class Task:
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Findings for the record about levels and their print; ``folder`` contains the arrays."""
+        """Findings about levels and their print, for the record; ``folder`` contains the arrays."""
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(

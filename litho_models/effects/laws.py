@@ -20,8 +20,8 @@ from litho_models.effects.filters import add_blur, add_filtered, gradient, round
 
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _RIM_UM = 2.0
-# So near to each other that over a micrometre none of them is out of step with a wave between them.
-_FREQUENCIES_PER_UM = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 9.5, 10.0)
+# Over a micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
+_FREQUENCIES_PER_UM = tuple(0.5 * half for half in range(4, 21))
 _WORDS = ("x", "y", "r²", "rim")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
@@ -77,9 +77,9 @@ class Surface:
         """A step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
         pixel.
         """
-        y, x = self.context.scan_position()
-        at, size = (y, self.context.whole_shape()[0]) if axis == "y" else (x, self.context.whole_shape()[1])
-        return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h) + 0 * self.h
+        number = "yx".index(axis)
+        at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
+        return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
         """Gaussian-weighted local mean of a map, by default the height."""

@@ -1,4 +1,4 @@
-"""Names and folders of the frozen models in the package, those of the benchmark's table.
+"""Names and folders of the frozen models in the package: the models of the benchmark's table.
 
 ``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
 """

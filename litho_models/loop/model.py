@@ -148,10 +148,6 @@ class Twin:
         effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
         return replace(self, effects=effects)
 
-    def over(self, base: nn.Module) -> Twin:
-        """The same effects over another base."""
-        return replace(self, base=base, numbers=_numbers(base))
-
     def with_base_unfitted(self) -> Twin:
         """Reset the base to its default values."""
         if not (self.own and isinstance(self.base, Simulator)):

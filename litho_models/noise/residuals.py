@@ -36,7 +36,7 @@ class Residuals(NamedTuple):
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Measured minus predicted, each scan freed of its nuisances by cross-fitting.
+    """Residuals of each scan, measured minus predicted, without its own terms (fitted on other pixels).
 
     The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
     shared background, so that these are the residuals whose mean absolute value is the error stated there.
