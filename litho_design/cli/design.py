@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=DesignSettings)
 
-# A variant or a task in the changes replaces these.
+# A variant or a task among the changes replaces the ones given here.
 _hologram = partial(hologram_settings, "default")
 _lens = partial(lens_settings, "direct", "default")
 
@@ -82,7 +82,8 @@ def first(
     target: Target = "text",
     device: Device = "cpu",
 ) -> None:
-    """Design one small hologram with and without a printer's model, and show both prints; takes a minute.
+    """Design one small hologram with and without a printer's model, and show both prints; this takes a
+    minute.
 
     Example: litho-design first --target ring
     """
@@ -150,7 +151,7 @@ def correct(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued.
+    """Find the layout whose print comes closest to the wanted relief; an interrupted run in OUT is continued.
 
     Example: litho-design correct blaze --model zoo:pbl --out blaze
     Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
@@ -262,7 +263,7 @@ def _settings(
     task: str,
     spread_of: Path | None = None,
 ) -> S:
-    """The preset, settings file, measured spreads and command line; each overrides those before it."""
+    """Merge preset, settings file, measured spreads and command line; each overrides those before it."""
     made = make(given.over(make({}), task))
     if spread_of is None:
         return made

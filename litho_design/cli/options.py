@@ -1,4 +1,4 @@
-"""Make options from the fields of the settings, so every setting is stated in one place."""
+"""Make command-line options from the fields of the settings, so that every setting is stated in one place."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Given:
     config: Path | None
 
     def over(self, preset: BaseModel, task: str) -> dict[str, Any]:
-        """Values by path, from the file, overridden by those of the command line.
+        """Return the values by path: those of the file, overridden by those of the command line.
 
         Args:
             preset: settings that define the paths.
@@ -100,7 +100,7 @@ def takes_settings(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of all settings that define one, plus ``--set`` and ``--config``.
 
-    The command takes them as its argument ``given``, a ``Given``.
+    The command receives these settings as its argument ``given``, a ``Given``.
 
     Args:
         presets: settings, one record per task; the help shows their values as defaults.
@@ -124,7 +124,7 @@ def takes_settings(
             }
             twice = sorted(set(options) & set(words))
             if twice:
-                raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="one of them")
+                raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two")
             unused = sorted(set(leave_out) & set(words))
             if unused:
                 raise InputError("--set", got=unused[0], wanted="a setting that this command leaves open")
@@ -137,9 +137,10 @@ def takes_settings(
 
 
 def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of the fields of some records, and pass it one of each by name.
+    """Give a command the options of all fields of some record classes, and pass it one record of each class
+    by name.
 
-    The command gets None for a record if none of its options is given.
+    The command gets None for a record if none of its options was given.
     """
     found = {
         part: {name: leaf_of(field, f"{part}.{name}") for name, field in kind.__pydantic_fields__.items()}
@@ -182,9 +183,9 @@ def _made(kind: type[Any], leaves: Mapping[str, Leaf], values: Mapping[str, Any]
 
 
 def as_toml(settings: BaseModel) -> str:
-    """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
+    """Return settings as a file for ``--config``: each with its meaning, unit, choices and option."""
     lines: list[str] = []
-    # Each table is written once, even if its settings are apart.
+    # Each table is written once, even if its settings are not adjacent.
     tables: dict[str, list[Leaf]] = {"": []}
     for leaf in leaves(settings):
         tables.setdefault(leaf.path.rpartition(".")[0], []).append(leaf)
@@ -228,7 +229,7 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """Description of a setting: in lower case for an option, capitalised in a file of settings."""
+    """Describe a setting: in lower case for an option, capitalised in a file of settings."""
     return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
 
 

@@ -48,7 +48,8 @@ def read(
     out: Out,
     device: Device = "cpu",
 ) -> None:
-    """Learn a model of the printer from the scans, find what it lacks, and compare both holograms.
+    """Learn a model of the printer from the scans of a sheet, find what the model lacks, and compare both
+    holograms.
 
     Example: litho-design sheet read sheet --out answer
     """

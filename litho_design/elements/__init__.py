@@ -1,1 +1,1 @@
-"""The printer as an optical element for your own programs: free levels in, a modulated wave out."""
+"""The printer as an optical element for your own programs: free levels go in, a modulated wave comes out."""

@@ -1,4 +1,6 @@
-"""A printed element as a differentiable module: from levels to printed heights to a wave behind the resin."""
+"""A printed element as a differentiable module: levels become printed heights, and these a wave behind the
+resin.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +30,14 @@ Index = Callable[[float], float]
 
 
 class Element(nn.Module):
-    """A printed element for your own program: ``element(field, wavelength_um)`` is the wave behind it.
+    """A printed element for your own program: ``element(field, wavelength_um)`` returns the wave behind the
+    element.
 
-    Its only trainable parameters are the free levels, one per cell or ring. They are rounded and kept within
-    the layout's levels with a straight-through gradient. A frozen model prints them with its guard ring, and
-    the printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The wave
-    therefore always belongs to a printable layout. ``whole = False`` leaves the levels real, for the first
-    steps.
+    The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and kept
+    within the layout's range, with a straight-through gradient. A frozen model prints the levels with its
+    guard ring. The printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The
+    wave therefore always belongs to a printable layout. ``whole = False`` leaves the levels unrounded, for
+    the first steps of a search.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
@@ -43,8 +46,8 @@ class Element(nn.Module):
         surroundings: refractive index above the relief.
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
         kind: ``thin``, or ``thick`` for the wave propagation method through the relief, in air.
-        tile_px: elements larger than this are printed in tiles with their halo. The gradient computes the
-            tiles again, so memory grows with the tile, not with the element; None prints in one piece.
+        tile_px: elements larger than this are printed in overlapping tiles. The gradient computes the tiles
+            again, so memory grows with the tile, not with the element; None prints in one piece.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
@@ -81,7 +84,7 @@ class Element(nn.Module):
         self.whole = True
 
     def forward(self, field: Tensor, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
-        """The wave behind the element lit by ``field``, complex (..., size, size).
+        """Return the wave behind the element that ``field`` illuminates, complex (..., size, size).
 
         Args:
             field: the wave on the pixels of the layout, complex (..., size, size).
@@ -97,14 +100,16 @@ class Element(nn.Module):
         return through_relief(field * kept, height, self.layout.pitch_um, self.optics(wavelength_um))
 
     def transmission(self, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
-        """Complex factor (size, size) of the thin element: exp(2 pi j (n - n0) h / wavelength - a h / 2)."""
+        """Return the complex factor (size, size) of the thin element: exp(2 pi j (n - n0) h / wavelength - a
+        h / 2).
+        """
         height = self.height_um() if height_um is None else height_um
         self._check_map("height", height)
         phase = height * (2 * math.pi / self.optics(wavelength_um).wave_height_um)
         return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
 
     def height_um(self) -> Tensor:
-        """Printed height (size, size), µm, with a gradient to the free levels."""
+        """Return the printed height (size, size), µm, with a gradient to the free levels."""
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
@@ -114,18 +119,18 @@ class Element(nn.Module):
         return self.printer.print_in_tiles(around, self.tile_px)
 
     def levels(self) -> np.ndarray:
-        """The layout to be printed, uint8 (size, size)."""
+        """Return the layout to be printed, uint8 (size, size)."""
         return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
 
     def optics(self, wavelength_um: float) -> Optics:
-        """Wavelength, index step and kind of the element at this wavelength."""
+        """Return the wavelength, index step and kind of the element at this wavelength."""
         if not SHORTEST_UM < wavelength_um < LONGEST_UM:
             wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
             hint = "are nm or metres meant? as_torchoptics(unit_um=1e6) counts in metres"
             raise InputError("wavelength", got=f"{wavelength_um:g} µm", wanted=wanted, hint=hint)
         index, around = self._index(wavelength_um), self.surroundings
         if not index > around:
-            raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than around it, {around:g}")
+            raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than that of its surroundings, {around:g}")
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
@@ -135,14 +140,15 @@ class Element(nn.Module):
         self.free.start_from(self.free.cells.average(pixels))
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
-        """Start from the levels that print a wanted phase (size, size), radian, up to a constant."""
+        """Start from the levels that print a wanted phase (size, size), radian, up to a constant phase."""
         self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
         wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
         self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
 
     def as_torchoptics(self, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0) -> Any:
-        """The same element as a ``PolychromaticModulationElement`` of torchoptics (extra ``torchoptics``).
+        """Return the same element as a ``PolychromaticModulationElement`` of torchoptics (extra
+        ``torchoptics``).
 
         Args:
             z, offset: position of the element, in your program's unit of length.

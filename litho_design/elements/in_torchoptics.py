@@ -1,4 +1,4 @@
-"""A printed element as an element of torchoptics; imported only if torchoptics is installed."""
+"""A printed element for torchoptics; this module is imported only if torchoptics is installed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchoptics.utils import wavelength_or_default
 
 
 class PrintedElement(PolychromaticModulationElement):
-    """An ``Element`` on a plane of torchoptics, which modulates fields of its shape and spacing.
+    """An ``Element`` on a plane of torchoptics; the fields that it modulates must have its shape and spacing.
 
     Args:
         element: the printed element, whose parameters become those of this module.
@@ -25,5 +25,5 @@ class PrintedElement(PolychromaticModulationElement):
         self.element, self.unit_um = element, unit_um
 
     def modulation_profile(self, wavelength: Any = None) -> Tensor:
-        """Complex transmission (size, size) at a wavelength, in the unit of torchoptics."""
+        """Return the complex transmission (size, size) at a wavelength, in the unit of torchoptics."""
         return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

@@ -13,7 +13,7 @@ Print = Callable[[Tensor], Tensor]
 
 
 def printed_anyhow(run: Print, level: Tensor) -> Tensor:
-    """``run(level)``, as one opaque step if a transform cannot trace it."""
+    """Return ``run(level)``, computed as one opaque step if a transform cannot trace it."""
     if "torch._dynamo" in sys.modules:
         run = torch.compiler.disable(run)
     if not torch._C._functorch.is_functorch_wrapped_tensor(level):
@@ -26,7 +26,7 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
         return printed
 
 
-# The mark that ``torch.compiler.disable`` sets; importing it would take two seconds.
+# This is the mark that ``torch.compiler.disable`` sets; importing that function would take two seconds.
 printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
 
 

@@ -1,1 +1,1 @@
-"""Files for the printer, each with its sidecar, and reading them back."""
+"""Write files for the printer, each with its sidecar, and read them back."""

@@ -1,4 +1,4 @@
-"""Export of a layout in one of the formats, and exact import of exported files."""
+"""Export a layout in one of the formats, and import exported files exactly."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _BAND_PX = 128
 
 @dataclass(frozen=True)
 class _Source:
-    """A layout to export: levels (ny, nx), their geometry and hash, and the design that they come from."""
+    """A layout to export: levels (ny, nx), geometry, hash, and the design that the levels come from."""
 
     levels: LevelRows
     layout: LayoutSettings
@@ -75,7 +75,7 @@ def export(
     marks: bool = False,
     **job: Any,
 ) -> Path:
-    """Write a layout for the printer, and ``<file>.json`` beside it.
+    """Write a layout for the printer, with the sidecar ``<file>.json``.
 
     The file is read back before the export counts as done. ``tiff`` and ``gds`` are written and read a band
     of rows at a time, so that memory does not grow with the height of an element.
@@ -152,7 +152,7 @@ def export(
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """The level map of an element, uint8 (ny, nx), row 0 on top, and the sidecar, from an exported file.
+    """Return the level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
 
     Raises:
         InputError: no sidecar, or a file that was changed.
@@ -187,7 +187,7 @@ def _loaded(file: str | Path) -> Any:
 
 
 def _levels(array: Any, level_height_um: float) -> np.ndarray:
-    """Levels, uint8 (ny, nx), of an array of levels, or of heights in µm."""
+    """Convert an array of levels, or of heights in µm, to levels, uint8 (ny, nx)."""
     if not isinstance(array, np.ndarray):
         wanted = "a design's folder, an Element, or an array of levels or heights in µm"
         raise InputError("layout to export", got=type(array).__name__, wanted=wanted)

@@ -1,4 +1,4 @@
-"""Layouts as GDSII, one layer per level in cells that repeat, written a band of rows at a time."""
+"""Write layouts as GDSII, one band of rows at a time: one layer per level, in cells that repeat."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def write_gds(
     layers: GdsLayers,
     parts: Mapping[str, Box] | None = None,
 ) -> int:
-    """Write rectangles, unit 1 µm, grid 1 nm, y up; returns the number in the file.
+    """Write rectangles, unit 1 µm, grid 1 nm, y up; return the number of rectangles in the file.
 
-    Layer k holds {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0).
-    Runs along rows are merged with equal runs in the rows below, so every shape is a rectangle. The cell
-    LAYOUT refers to one cell per part, which refers to one cell per 128 rows, which refers to blocks of 128
-    pixels; equal blocks share a cell. Memory holds the shapes of one block at a time.
+    Layer k contains {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0). Runs
+    along a row are merged with equal runs in the rows below, so every shape is a rectangle. The cell LAYOUT
+    refers to one cell per part, each of these to one cell per 128 rows, and each of those to blocks of 128
+    pixels. Equal blocks share a cell. Only the shapes of one block are in memory at a time.
 
     Args:
         parts: first and last row, first and last column of each part by name; by default the whole map is
@@ -71,7 +71,7 @@ def write_gds(
 
 
 def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]:
-    """The rectangles of one block, its lower left corner at 0."""
+    """Return the rectangles of one block, whose lower left corner is the origin."""
     from gdstk import rectangle
 
     highest = int(levels.max())
@@ -86,14 +86,15 @@ def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]
 
 
 def rectangles(masks: np.ndarray) -> np.ndarray:
-    """Disjoint rectangles that cover boolean masks (n, ny, nx): mask, top, bottom, left, right (m, 5).
+    """Return disjoint rectangles that cover boolean masks (n, ny, nx): mask, top, bottom, left, right (m, 5).
 
     Ends are excluded.
     """
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)
     right = np.nonzero(edges < 0)[2]
-    # Equal runs of one mask, from top to bottom: a rectangle continues while no row is missing.
+    # Equal runs of one mask are sorted from top to bottom: a rectangle continues as long as no row is
+    # missing.
     order = np.lexsort([row, right, left, mask])
     mask, row, left, right = (one[order] for one in (mask, row, left, right))
     new = np.ones(len(row) + 1, bool)

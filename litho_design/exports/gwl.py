@@ -1,4 +1,5 @@
-"""Layouts as GWL for Nanoscribe printers: one line of resist per run of pixels in a row and slice."""
+"""Write layouts as GWL for Nanoscribe printers: one line of resist for each run of pixels in a row and slice.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +17,12 @@ _PIEZO_UM = 300.0
 
 
 def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
-    """Write the slices from the pedestal up, field by field; returns the number of lines.
+    """Write the slices from the pedestal up, field by field; return the number of lines.
 
-    A slice is written at the middle of its thickness, a row at the middle of its hatching distance, and a
-    line of resist runs along x from edge to edge of the pixels that reach the slice. x and y are those of the
-    element, y up; in galvo mode they count from the middle of the field, to which the stage moves.
+    A slice is written at the middle of its thickness, and a row at the middle of its hatching distance. A
+    line of resist runs along x from edge to edge of the pixels that reach the slice. Coordinates x and y are
+    those of the element, y up; in galvo mode they are relative to the middle of the field, to which the stage
+    moves.
 
     Raises:
         InputError: a level height or pedestal that is not a whole number of slices, a pitch that is not a
@@ -72,7 +74,7 @@ def _head(job: Gwl) -> str:
 
 
 def _runs(mask: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Row, begin and end of the runs of a mask (ny, nx), the lowest row first."""
+    """Yield the row, begin and end of each run of a mask (ny, nx), lowest row first."""
     edges = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)[::-1]
     row, begin = np.nonzero(edges > 0)
     end = np.nonzero(edges < 0)[1]

@@ -1,4 +1,4 @@
-"""Layouts as grey images: grey is linear in height, or follows a dose curve."""
+"""Write layouts as grey images: grey is linear in height, or follows a dose curve."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from litho_design.printers.layout import LayoutSettings
 
 _UM_PER_CM = 1e4
 _STRIP_PX = 64
-# Offsets in a TIFF have 32 bits; a file beyond this size, with room for its tags, is a BigTIFF.
+# Offsets in a TIFF have 32 bits. A file beyond this size, which leaves room for the tags, is written as a
+# BigTIFF.
 _CLASSIC_BYTES = 2**32 - 2**24
 
 
 def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
-    """Grey of each level: linear in height, as many values per level as ``bits`` allow.
+    """Return the grey of each level: linear in height, with as many grey values per level as ``bits`` allow.
 
     Raises:
         InputError: more levels than grey values.
@@ -32,7 +33,7 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
-    """Greys for which the printer's measured heights equal those of the levels, up to a constant height.
+    """Return the greys whose measured heights equal those of the levels, up to a constant height.
 
     Args:
         curve: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
@@ -60,7 +61,7 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
-    """Write a 16-bit grey PNG, or an 8-bit BMP and beside it a CSV of grey and height."""
+    """Write a 16-bit grey PNG, or an 8-bit BMP with a CSV of grey and height."""
     import cv2
 
     kind = np.uint8 if path.suffix == ".bmp" else np.uint16
@@ -73,9 +74,10 @@ def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_heig
 
 
 def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float) -> None:
-    """Write a TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with its resolution.
+    """Write a TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with the resolution.
 
-    It is written strip by strip; if a TIFF cannot hold the pages, as a BigTIFF compressed by deflate.
+    The file is written strip by strip, and as a BigTIFF compressed by deflate if a TIFF cannot hold the
+    pages.
     """
     import tifffile
 

@@ -1,4 +1,4 @@
-"""Settings of a print job besides the layout: format, base, slices and lines."""
+"""Settings of a print job in addition to the layout: format, base, slices and lines."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Gwl(Record):
 
 
 class PrintJob(Record):
-    """STL and GWL print the base; the sidecar of every format records it, slicing and hatching."""
+    """STL and GWL print the base; the sidecar of every format records base, slicing and hatching."""
 
     pedestal_um: float = setting(1.0, "Base under level 0", unit="µm", option="--pedestal-um", ge=0, le=_MOST)
     slicing_um: float = setting(0.1, "Slicing distance", unit="µm", option="--slicing-um", gt=0, le=_MOST)

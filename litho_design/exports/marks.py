@@ -1,4 +1,4 @@
-"""Prints beside an element: a mark that shows its orientation, and a flat witness of its height."""
+"""Print two marks beside an element: an F that shows its orientation, and a flat witness of its height."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ _FLAT_UM = 4.0
 
 
 class Marks(Record):
-    """Where element, mark and witness lie in an exported map: rows from, to, columns from, to, in pixels.
+    """Positions of element, mark and witness in an exported map: first and last row, first and last column,
+    in pixels.
 
-    ``witness_height_um`` is the height of the middle of the witness over the ground, as the design's model
-    prints it.
+    ``witness_height_um`` is the height that the design's model predicts for the middle of the witness over
+    the ground.
     """
 
     element_px: Box
@@ -34,14 +35,14 @@ class Marks(Record):
     witness_height_um: float
 
     def parts(self) -> dict[str, Box]:
-        """The three by name."""
+        """Return the positions of element, mark and witness by name."""
         return {"ELEMENT": self.element_px, "ORIENTATION": self.orientation_px, "WITNESS": self.witness_px}
 
 
 def with_marks(
     levels: LevelRows, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
 ) -> tuple[np.ndarray, Marks]:
-    """The level map (size, size) with an F and a square of the highest level to the right of it.
+    """Add an F and a square of the highest level to the right of a level map (size, size).
 
     Both are at least the printer's reach away from the element and from each other, so that none changes the
     print of another. Everything lies on whole cells.

@@ -1,4 +1,4 @@
-"""The levels of an element of any size, a band of rows at a time."""
+"""Read the levels of an element of any size, one band of rows at a time."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx), row 0 on top, in memory or on disk, whose rows are sliced like an array's."""
+    """A level map (ny, nx), row 0 on top, in memory or on disk; its rows are sliced like those of an array.
+    """
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(ny, nx)."""
+        """Return (ny, nx)."""
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """These rows, all columns."""
+        """Return these rows, all columns."""
 
 
 @dataclass(frozen=True)
 class RingRows:
-    """The plane of a lens of rings; only the requested rows are made.
+    """The plane of a lens of rings, of which only the requested rows are computed.
 
     Args:
         ring_level: level at each pixel of the radius, uint8; corners beyond the aperture take the last level.
@@ -35,7 +36,7 @@ class RingRows:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(ny, nx)."""
+        """Return (ny, nx)."""
         return (2 * len(self.ring_level),) * 2
 
     def __getitem__(self, rows: slice) -> np.ndarray:
@@ -48,7 +49,8 @@ class RingRows:
 
 
 def layout_rows(folder: str | Path) -> LevelRows:
-    """The layout of a design folder, checked against the hash in its record; it stays on disk.
+    """Open the layout of a design folder and check it against the hash in its record; the array stays on
+    disk.
 
     Raises:
         InputError: no design, or levels that changed after it.
@@ -59,6 +61,6 @@ def layout_rows(folder: str | Path) -> LevelRows:
 
 
 def bands_of(levels: LevelRows, band_px: int) -> Iterator[slice]:
-    """Rows of a map, ``band_px`` at a time; the last band may have fewer."""
+    """Yield the rows of a map, ``band_px`` at a time; the last band may have fewer."""
     height = levels.shape[0]
     return (slice(top, min(top + band_px, height)) for top in range(0, height, band_px))

@@ -21,7 +21,9 @@ _OF_DESIGN = ("printer", "stroke", "out_of_distribution", "predicted", "settings
 
 
 class Sidecar(Result):
-    """<file>.json beside an exported file; without a design, the design's own fields are missing."""
+    """The contents of <file>.json, stored with an exported file; without a design, the design's own fields
+    are missing.
+    """
 
     SCHEMA: ClassVar[str] = "litho-design/export/2"
     FILE_NAME: ClassVar[str] = "export.json"
@@ -66,12 +68,12 @@ class Sidecar(Result):
 
 
 def cell_of(layout: LayoutSettings) -> int:
-    """Side in pixels of the squares of one level, which a ring layout does not have."""
+    """Return the side, in pixels, of the squares of one level; a ring layout has none."""
     return 1 if layout.symmetry == "radial" else layout.cell_px
 
 
 def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, Any]:
-    """Fields of the sidecar for a map of this shape."""
+    """Return the fields of the sidecar for a map of this shape."""
     return {
         "shape_px": shape_px,
         "pitch_um": layout.pitch_um,
@@ -85,7 +87,7 @@ def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, An
 
 
 def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
-    """Fields of the sidecar for a print job; those of another format are None."""
+    """Return the fields of the sidecar for a print job; fields of other formats are None."""
     return {
         **job.model_dump(include={"pedestal_um", "slicing_um", "hatching_um"}),
         "gds_layers": job.gds_layers if format == "gds" else None,
@@ -94,7 +96,7 @@ def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
 
 
 def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
-    """Fields of the sidecar that come from a design; empty without one."""
+    """Return the fields of the sidecar that come from a design; without a design, return none."""
     if folder is None or design is None:
         return {}
     shared = {name: getattr(design, name) for name in _OF_DESIGN}
@@ -102,12 +104,12 @@ def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
 
 
 def sidecar_path(file: Path) -> Path:
-    """Path of the sidecar of a file."""
+    """Return the path of the sidecar of a file."""
     return file.with_name(file.name + ".json")
 
 
 def read_sidecar(file: Path) -> Sidecar:
-    """The sidecar of an exported file, checked against the file.
+    """Read the sidecar of an exported file and check the file against it.
 
     Raises:
         InputError: no sidecar, or a file that was changed after the export.

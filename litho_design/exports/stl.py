@@ -1,4 +1,4 @@
-"""Layouts as a closed solid (binary STL, µm): two triangles per top; walls meet corner to corner."""
+"""Write layouts as a closed solid (binary STL, µm): two triangles per top; walls meet corner to corner."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from litho_data.foundation.errors import InputError
 
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER_BYTES = 80
-# If columns touch only along an edge, the higher one is moved away from it by this share of a cell.
+# If two columns touch only along an edge, the higher column is moved away from the edge by this share of a
+# cell.
 _APART = 1 / 128
 # Directions (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
 _WAY = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)], np.float32)
@@ -20,9 +21,9 @@ _BELOW = -1
 def write_stl(
     path: Path, levels: np.ndarray, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> int:
-    """Write the surface ``pedestal_um + level * level_height_um``; returns the number of triangles.
+    """Write the surface ``pedestal_um + level * level_height_um``; return the number of triangles.
 
-    Every edge has two faces, even where columns touch only along an edge; see ``step_solid``.
+    Every edge belongs to two faces, even where columns touch only along an edge; see ``step_solid``.
 
     Args:
         levels: integer levels per cell (ny, nx), row 0 on top; y grows up in the file.
@@ -50,16 +51,17 @@ def write_stl(
 
 
 def step_solid(levels: np.ndarray) -> np.ndarray:
-    """Triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
+    """Return triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
 
-    Every edge has two faces, which traverse it in opposite directions: a wall has a corner at the height of
-    each top among the four columns around its ends.
+    Every edge belongs to two faces, which traverse it in opposite directions: a wall has a corner at the
+    height of each top among the four columns around its ends.
 
     Args:
         levels: integers (ny, nx) of 0 or more; y grows with the row.
 
     Returns:
-        x and y in cells, z in levels, with -1 for the underside; counter-clockwise from outside.
+        x and y are in cells and z in levels, -1 for the underside; triangles run counter-clockwise as seen
+        from outside.
     """
     cells = np.pad(np.asarray(levels, np.int16), 1, constant_values=_BELOW)
     around = np.stack([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=-1)
@@ -82,16 +84,17 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Positions (n, 3) at points (n, 2), row and column; some are moved towards a cell."""
+    """Return positions (n, 3) at points (n, 2), row and column; some points are moved towards a cell."""
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)
 
 
 def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """Two triangles for each cell."""
+    """Return two triangles for each cell."""
     cell = np.argwhere(around[:-1, :-1, 3] >= 0)
     z = around[cell[:, 0], cell[:, 1], 3]
-    # The cell's south-west point, from which the cell lies north-east, and so on around the cell.
+    # The loop starts at the cell's south-west point, from which the cell lies north-east, and goes around the
+    # cell.
     corners = []
     for step, way in (((0, 0), 3), ((0, 1), 2), ((1, 1), 0), ((1, 0), 1)):
         point = cell + step
@@ -101,19 +104,19 @@ def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
 
 
 def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """Triangles of the walls between rows of cells."""
+    """Return the triangles of the walls between rows of cells."""
     row, column = np.nonzero(cells[:-1, 1:-1] != cells[1:, 1:-1])
     south, north = cells[row, column + 1], cells[row + 1, column + 1]
     low, high = np.minimum(south, north), np.maximum(south, north)
     ends = []
-    # Direction of the higher cell from the western and from the eastern end.
+    # This is the direction of the higher cell as seen from the western and from the eastern end.
     for point, place in (
         (np.stack([row, column], 1), np.where(north > south, 3, 1)),
         (np.stack([row, column + 1], 1), np.where(north > south, 2, 0)),
     ):
         at = (point[:, 0], point[:, 1])
         moved, levels = aside[*at, place], around[at].copy()
-        # The edge of a moved column passes by the column from which it was moved away.
+        # The edge of a moved column passes beside the column from which it was moved away.
         opposite = np.arange(len(row)), 3 - place
         levels[opposite] = np.where(moved, low, levels[opposite])
         chain = np.sort(levels.clip(low[:, None], high[:, None]), axis=1)
@@ -131,7 +134,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
 
 
 def _underside(shape: tuple[int, ...]) -> np.ndarray:
-    """A fan from the middle to all points of the rim."""
+    """Return a fan from the middle to all points of the rim."""
     ny, nx = shape
     south, east = [(0, x) for x in range(nx)], [(y, nx) for y in range(ny)]
     north, west = [(ny, x) for x in range(nx, 0, -1)], [(y, 0) for y in range(ny, 0, -1)]

@@ -1,4 +1,4 @@
-"""Baseline scores of a hologram on the same grid: of a black image, and of ideal elements."""
+"""Score a black image and ideal elements on the grid of a hologram, as baselines."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssi
 def hologram_baselines(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
 ) -> dict[str, dict[str, float]]:
-    """Scores of a black image, and of ideal elements in the optics of ``bench``, by name.
+    """Return the scores of a black image and of ideal elements in the optics of ``bench``, by name.
 
-    ``diffraction-limited``: an element of free amplitude and phase, with a flat phase in the image, found by
-    forty Gerchberg-Saxton steps. ``continuous phase``: one phase per cell, without printer and levels, from a
-    Gerchberg-Saxton start and a hundred steps down the design's own loss, which is among the scores.
-    ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
+    ``diffraction-limited``: an element of free amplitude and phase, found by forty Gerchberg-Saxton steps,
+    whose image has a flat phase. ``continuous phase``: one phase per cell, without printer and levels. It
+    starts from Gerchberg-Saxton and takes a hundred steps down the design's own loss, which is among the
+    scores. ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -55,10 +55,11 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Power on the signal {T > 0.5} of a phase that is optimised for this power from a print (size, size).
+    """Find a phase with the most power on the signal {T > 0.5}, starting from a print (size, size); return
+    that power.
 
-    Each step is u <- exp(j arg P^H S P u), with S the signal and one phase per pixel. P^H S P is positive, so
-    no step lowers the share, and the result is never below the print's share.
+    Each step is u <- exp(j arg P^H S P u), where S selects the signal; every pixel has its own phase. P^H S P
+    is positive, so no step reduces the power, and the result is never below that of the print.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)
@@ -78,7 +79,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """The wave (size, size) of unit power whose image comes closest to sqrt(target), from a flat phase."""
+    """Return the wave (size, size) of unit power whose image comes closest to sqrt(target) with a flat phase.
+    """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)
     wave = bench.propagator.adjoint(wanted.to(torch.complex64))
@@ -93,7 +95,7 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
-    """The phase per cell with the lowest loss, radian, and that loss."""
+    """Return the phases of the cells, radian, with the lowest loss, and that loss."""
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
         counted=counted,

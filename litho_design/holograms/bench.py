@@ -40,7 +40,7 @@ class HologramBench(ElementBench):
         return hologram_score(waves, element, target, self.grid, self.optics)
 
     def resolved(self, target: Tensor) -> Tensor:
-        """``target`` (size, size) at the resolution of the element."""
+        """Return ``target`` (size, size) at the resolution of the element."""
         return at_resolution(target, self.grid, self.optics)
 
 
@@ -66,7 +66,9 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """With a signal window: light beyond it is free, but the other figures count it as an error."""
+    """The score with a signal window: light outside the window is free in the loss, but counts as an error in
+    the other figures.
+    """
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
 
@@ -74,10 +76,10 @@ class WindowedHologramScore(HologramScore):
 def hologram_score(
     waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics
 ) -> HologramScore:
-    """Score the sum of the intensities of the waves in the image plane against the wanted image.
+    """Score the summed intensity of the waves in the image plane against the wanted image.
 
-    S = {T > 0.5}; scale before comparison c = sum(I T) / sum(I^2); SSIM with an 11 px Gaussian
-    window, sigma 1.5, data range 1, on c I clipped to [0, 1].
+    The signal is S = {T > 0.5}. Before comparison the image is scaled by c = sum(I T) / sum(I^2). SSIM uses
+    an 11 px Gaussian window, sigma 1.5 and data range 1, on c I clipped to [0, 1].
 
     Args:
         waves: shares of the light, and complex (m, m) in the image plane, for unit incident power, 1/µm.
@@ -102,23 +104,25 @@ def hologram_score(
 
 
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
-    """A target (m, m) at the resolution of an element of the same size, real (m, m).
+    """Return a target (m, m) at the resolution of an element of the same size, real (m, m).
 
-    It is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes, with the NA
-    from the axis to the edge, and is dark beyond the window.
+    The target is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
+    where NA is that from the axis to the edge. Beyond the window it is dark.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
         aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
-        # Row i holds the weights of all pixels in pixel i: two matrix products instead of long convolutions.
+        # Row i contains the weights of all pixels in pixel i, so two matrix products replace long
+        # convolutions.
         blurs.append((focus / focus.sum()).unfold(0, count, 1).flip(1))
     return blurs[0] @ target @ blurs[1].T
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Share of the power behind the element that is in its mean, the undiffracted plane wave."""
+    """Return the share of the power behind the element that belongs to its mean, the undiffracted plane wave.
+    """
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)
 
@@ -129,7 +133,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """SSIM of the light of the waves as a camera records it, against the target on the camera's pixels."""
+    """Return the SSIM of the waves' light, as a camera records it, against the target on the camera's pixels.
+    """
     import cv2
 
     seen = _added(
@@ -149,9 +154,9 @@ def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -
 def through_aperture(
     field: Tensor, grid: PixelGrid, wavelength_um: float, numerical_aperture: float
 ) -> Tensor:
-    """The field after an ideal objective: spatial frequencies above NA / wavelength removed.
+    """Return the field after an ideal objective, which removes spatial frequencies above NA / wavelength.
 
-    The window is mirrored once so that its edges do not meet across the period of the transform.
+    The window is mirrored once, because the transform is periodic and would otherwise join opposite edges.
     """
     rows, columns = field.shape
     mirrored = torch.cat([field, field.flip(0)], 0)

@@ -14,7 +14,9 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Pixels (size, size) near the wanted light, which count in the error; None for all."""
+    """Select the pixels (size, size) near the wanted light, which count in the error; None stands for all
+    pixels.
+    """
     if not settings.signal_window_um:
         return None
     from scipy.ndimage import distance_transform_edt
@@ -30,7 +32,7 @@ def hologram_loss(
     counted: Tensor | None = None,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Loss of an image and its parts by name.
+    """Return the loss of an image and its parts by name.
 
     Args:
         share: share of the incident power on each pixel (size, size).

@@ -1,4 +1,4 @@
-"""All settings of a hologram, by preset, including the choices that the paper leaves open."""
+"""The settings of a hologram and their presets, including the choices that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class HologramLoss(Record):
 
     With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; light
     beyond them is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
-    doi:10.1364/OE.16.002176). ``scale`` matches the image to the target: ``paper`` divides by the mean over
-    the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is the share
-    of the incident power on pixels whose target is above zero.
+    doi:10.1364/OE.16.002176). ``scale`` says how the image is matched to the target: ``paper`` divides by the
+    mean over the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is
+    the share of the incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
@@ -50,14 +50,14 @@ class HologramSettings(DesignSettings):
 def hologram_settings(
     variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> HologramSettings:
-    """A preset of the hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
+    """Return a preset of the hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
 
-    ``paper``: as printed (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
-    iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
-    temperature 1, a tenth of the rate after more than ten iterations without progress, wavelength 0.633 and
-    index step 0.545; its efficiency term is constant and therefore left out). For what is not reproduced of
-    that code, see docs/from_the_authors_code.md. ``default``: one height per cell from a Gerchberg-Saxton
-    start, and a polish of the printable layout.
+    ``paper``: as printed in the paper (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
+    iterations at 0.1, expected levels). ``authors``: as in the published code. It has 12 levels, temperature
+    1, wavelength 0.633 and index step 0.545; after more than ten iterations without progress the rate falls
+    to a tenth. The code's efficiency term is constant and therefore left out. docs/from_the_authors_code.md
+    lists what is not reproduced of that code. ``default``: one height per cell from a Gerchberg-Saxton start,
+    followed by a polish of the printable layout.
 
     Args:
         variant: the preset; a ``variant`` in the changes replaces it.

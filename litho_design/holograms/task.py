@@ -1,4 +1,4 @@
-"""The hologram as a task: from levels on the pixels to a loss, a score and the saved arrays."""
+"""The hologram as a task: it turns levels on the pixels into a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class HologramTask(Task):
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
-    # Sums over the pixels of the whole element, of which target and cells may be a part.
+    # Sums over the pixels of the whole element; target and cells may be only a part of it.
     total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
@@ -72,7 +72,7 @@ class HologramTask(Task):
         self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
 
     def make_bench(self, optics: Optics) -> HologramBench:
-        """The bench from the element to the image plane."""
+        """Return the bench from the element to the image plane."""
         return HologramBench(self.settings.layout, optics).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
@@ -80,7 +80,7 @@ class HologramTask(Task):
         return hologram_loss(seen, self.target, self.settings.loss, self.counted, self.total)
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Loss, SI-PSNR and signal efficiency."""
+        """Return the loss, SI-PSNR and signal efficiency."""
         figures = {
             "loss": float(self.loss(seen)[0]),
             "si_psnr_db": si_psnr_db(seen.double(), self.target.double()),
@@ -89,7 +89,8 @@ class HologramTask(Task):
         return figures | self._inside_window(seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels that print the phases of ``gerchberg_saxton``, weighted for ``wgs``."""
+        """Return the levels that print the phases of ``gerchberg_saxton`` (weighted if the start is ``wgs``).
+        """
         search = self.settings.search
         phase, _ = gerchberg_saxton(
             self.bench.propagator, self.target, self.cells, iterations=_START_ITERATIONS,
@@ -99,7 +100,7 @@ class HologramTask(Task):
         return nearest_levels(phase, level_phase)
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
-        """Score of the image behind a print (size, size), µm."""
+        """Return the score of the image behind a print (size, size), µm."""
         score = self.bench.score(height_um, self.target)
         if self.counted is None:
             return score
@@ -113,28 +114,28 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Signal efficiency of the continuous phase of most power that is found from the print."""
+        """Return the signal efficiency of a continuous phase with the most power, found from the print."""
         return best_signal_efficiency(self.bench, height_um, self.target)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores of a black image and of ideal elements on the same grid."""
+        """Return the scores of a black image and of ideal elements on the same grid."""
         return hologram_baselines(self.bench, self.cells, self.target, self.settings)
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """The image scaled to its target."""
+        """Return the image scaled to its target."""
         target = self.inputs["target"]
         return (seen * target).sum() / max(float((seen**2).sum()), 1e-30) * seen
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
-    """A note if diffraction blurs the strokes of the target, whatever the layout."""
+    """Return a note if diffraction will blur the strokes of the target, whatever the layout."""
     layout, optics = settings.layout, settings.optics
     stroke_um = stroke_width_px(target) * layout.pitch_um
     finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
     if stroke_um >= finest_um:
         return []
     near_um = stroke_um / finest_um * optics.distance_um
-    # Two digits, rounded down, so that nothing is too fine at the advised distance.
+    # Round down to two digits, so that nothing is too fine at the advised distance.
     digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
     near_um = math.floor(near_um / digit_um) * digit_um
     return [
@@ -157,7 +158,7 @@ def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
         raise InputError("target", got=f"{target.shape} px", wanted=f"{wanted} px, the size of the element")
     if not np.isfinite(target).all() or target.min() < 0 or target.max() > 1 or target.max() == 0:
         raise InputError("target", got="values outside [0, 1] or no light", wanted="an image in [0, 1]")
-    # The scores compare the signal {T > 0.5} with what is around it.
+    # The scores compare the signal {T > 0.5} with its surroundings.
     share = float((target > 0.5).mean())
     if share in (0.0, 1.0):
         raise InputError(

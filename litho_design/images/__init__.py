@@ -1,1 +1,1 @@
-"""Target images, photographs, and measures of similarity."""
+"""Draw and read target images, register photographs, and measure the similarity of images."""

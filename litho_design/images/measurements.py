@@ -1,4 +1,4 @@
-"""What is measured of a printed element: a height map of it, or a photograph of its light."""
+"""Measurements of a printed element: a height map of the element, or a photograph of its light."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ Levelling = Literal["none", "plane", "bow"]
 
 @dataclass(frozen=True)
 class MeasuredSource:
-    """A height map of the printed part; unit and size (one side, or y and x) if the file does not state them.
+    """A height map of the printed part; give unit and size (one side, or y and x) if the file does not state
+    them.
 
-    ``aligned`` is for elements that look alike in several places or orientations, such as a lens cap or a
+    Use ``aligned`` for elements that look alike in several places or orientations, such as a lens cap or a
     blaze.
     """
 

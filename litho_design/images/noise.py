@@ -1,4 +1,6 @@
-"""White noise of a measured map, and the change of a score within the uncertainty of a measurement."""
+"""Estimate the white noise of a measured map, and how a score changes within the uncertainty of a
+measurement.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +14,25 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of draws from a measurement's uncertainty, which gives their rms to 25 %.
+# Number of random draws within a measurement's uncertainty; their rms is known to 25 %.
 DRAWS = 8
 # Beyond this frequency along both axes, cycles/px, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
 
 def white_noise(values: np.ndarray) -> float:
-    """Standard deviation of the white noise in a map (ny, nx), from its highest frequencies."""
+    """Return the standard deviation of the white noise in a map (ny, nx), from its highest frequencies."""
     window, high = _window_and_band(values.shape)
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()
     return float(np.sqrt(power[high].mean()))
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Noise of a photograph (ny, nx): sd in the dark, and sd as a share of the light, as of speckle.
+    """Return the noise of a photograph (ny, nx): its sd in the dark, and its sd as a share of the light, as
+    speckle has.
 
-    The variance of the highest frequencies is fitted as the square of the first plus that of the second times
-    the light.
+    The variance of the highest frequencies is fitted as (sd in the dark)^2 + (share)^2 times the squared
+    light.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -43,20 +46,22 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
 
 
 def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Hann window of a map, and the mask of its frequencies that hold only noise."""
+    """Return the Hann window of a map, and the mask of the frequencies that contain only noise."""
     along = [np.abs(np.fft.fftfreq(count)) > _NOISE_BAND for count in shape]
     return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:
-    """Rms change of every figure of ``measured`` over variants of the measurement: one standard deviation."""
+    """Return the rms change of every figure of ``measured`` over variants of the measurement, as one standard
+    deviation.
+    """
     return {name: float(np.sqrt(np.mean(found**2))) for name, found in _changes(score, measured, variants)}
 
 
 def freed_of_noise(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Figures without the bias from noise, and the standard deviation of each.
+    """Return figures corrected for the bias from noise, and the standard deviation of each figure.
 
     The measurement already contains noise, and the variants add as much again; their mean change estimates
     the change that the measurement's own noise caused (bias correction by bootstrap, Efron and Tibshirani
@@ -71,7 +76,7 @@ def freed_of_noise(
 def _changes(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """The changes of every figure of ``measured`` over variants of the measurement."""
+    """Yield the changes of every figure of ``measured`` over variants of the measurement."""
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
     for name, value in measured.model_dump(exclude_none=True).items():
         yield name, np.array([one[name] for one in scores]) - value

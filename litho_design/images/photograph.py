@@ -1,4 +1,4 @@
-"""Photographs, cleaned and registered on the image that a design expects."""
+"""Clean a photograph and register it on the image that a design expects."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _LARGEST_SATURATED = 0.01
 # Prints close to the expected one give apparent exponents of counts over light of 0.9 to 1.1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
-# Sd of the loss of light that an objective may have in the corners.
+# Sd of the loss of light in the corners, which depends on the objective.
 _VIGNETTING_SD = 0.1
-# A tilt is accepted if the unexplained variance falls below this share of that without a tilt.
+# A tilt is accepted if it reduces the unexplained variance below this share of the value without a tilt.
 _NEEDED = 0.93
 # Sd of the plausible tilts of a camera, over half the window.
 _TILT_SD = 0.1
@@ -41,12 +41,13 @@ _TIE = 0.03
 
 
 class CameraRecord(Record):
-    """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens.
+    """Source and processing of a photograph; ``imaged`` is the object in front of a lens.
 
-    ``orientation`` is the operation that brings the photograph onto the image; ``ambiguous`` lists others
-    that fit as well. ``noise_counts`` is the noise (sd) in the dark and ``noise_share`` the further noise as
-    a share of the light; ``vignetting_sd`` is the possible loss in the camera's corners; ``blur_um`` is the
-    fitted blur (sd) beyond the expected image and ``gamma`` the fitted exponent of counts over light.
+    ``orientation`` is the operation that turns the photograph onto the image; ``ambiguous`` lists other
+    operations that fit as well. ``noise_counts`` is the noise (sd) in the dark, and ``noise_share`` the
+    additional noise as a share of the light. ``vignetting_sd`` is the possible loss of light in the camera's
+    corners. ``blur_um`` is the fitted blur (sd) beyond that of the expected image, and ``gamma`` the fitted
+    exponent of counts over light.
     """
 
     name: str
@@ -73,7 +74,7 @@ class CameraRecord(Record):
     notes: list[str]
 
     def remarks(self) -> list[str]:
-        """Remarks about the photograph, one phrase each."""
+        """Return remarks about the photograph, one phrase each."""
         found = list(self.notes)
         if self.orientation != "identity":
             found.append(f"the photograph was brought onto the image by {self.orientation}, as asked")
@@ -116,17 +117,22 @@ class Photograph:
     expected: np.ndarray
 
     def image(self) -> np.ndarray:
-        """Counts per pixel of the photograph, on the window (m, m); noise may make them negative."""
+        """Return the photograph resampled on the window (m, m), in counts per camera pixel; noise may make
+        them negative.
+        """
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
-        """``image`` as shares of the light on the element, from the summed counts of that light."""
+        """Express ``image`` as shares of the light on the element, whose summed counts are ``power_counts``.
+        """
         # Pixels of the photograph per pixel in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Images that are as plausible: other noise, dark level, position, size and vignetting, in pairs."""
+        """Yield equally plausible images with other noise, dark level, position, size and vignetting, in
+        pairs.
+        """
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
         sd = np.sqrt(record.noise_counts**2 + (record.noise_share * light) ** 2)
@@ -153,8 +159,8 @@ class Photograph:
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
-        # Detail finer than any light of the element is noise; the rest is corrected for the mean over a
-        # pixel.
+        # Detail finer than the element's light can form is noise. The remaining detail is corrected for the
+        # averaging over a pixel.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
         sharp = (frequency <= self.finest_per_um) / np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
         kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(sharp, sharp), norm="ortho")
@@ -164,14 +170,14 @@ class Photograph:
 def photographed_image(
     wanted: np.ndarray, wanted_pitch_um: float, source: PhotoSource, finest_per_um: float
 ) -> Photograph:
-    """A photograph, registered on the image that the design expects.
+    """Register a photograph on the image that the design expects.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by their neighbours' median. Then
-    the photograph is fitted to the expected image, as seen by a camera that is moved, turned and, if needed,
-    tilted: by least squares, with gain and background free. The scale follows from the pitch, unless the
-    pitch has an uncertainty, because a print that is too large is not the camera's fault. All eight
-    orientations are tried, and a photograph that fits another orientation better than ``orientation`` is
-    refused.
+    a model of the camera (shifted, turned and, if needed, tilted) is fitted by least squares to the expected
+    image, with free gain and background. The scale follows from the pitch unless the pitch has an
+    uncertainty; otherwise an image that is too large because of the print would be blamed on the camera. All
+    eight orientations are tried, and a photograph that fits another orientation better than ``orientation``
+    is refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
@@ -213,7 +219,7 @@ def photographed_image(
         got = f"{100 * coverage:.0f} % of the image"
         wanted_share = f"at least {100 * _SMALLEST_COVERAGE:.0f} %"
         raise InputError(f"photograph {photo_file}", got=got, wanted=wanted_share)
-    # A print unlike the expected one is bright and dark in other places, which looks like a gamma, too.
+    # A print unlike the expected one is bright and dark in other places, which also looks like a gamma.
     open_gamma = _LARGEST_GAMMA_OFF + 2 * (1 - fit.correlation)
     if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
         raise InputError(
@@ -256,18 +262,19 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Share of pixels at the top of the range: of the file, or of 12 or 14 bits if counts pile up there."""
+    """Return the share of pixels at the top of the range: the range of the file, or 12 or 14 bits if counts
+    pile up there.
+    """
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
     at_top = float((raw == top).mean())
-    # A maximum that many pixels share and few others come close to is an end of the range, whatever its
-    # value.
+    # If many pixels share a maximum that few others come close to, the maximum is an end of the range.
     beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
     return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
 
 
 def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | None) -> np.ndarray:
-    """A photograph divided by the brightness of uniform light, whose mean is 1; its dark level stays."""
+    """Divide a photograph by the brightness of uniform light, scaled to mean 1; the dark level is kept."""
     from scipy.ndimage import gaussian_filter
 
     flat = read_grey(flat_file, "photograph of uniform light")[0].astype(np.float32)
@@ -280,7 +287,9 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
 
 
 def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
-    """The dark level that makes the darkest pixels of the photograph as bright as expected, and its sd."""
+    """Return the dark level at which the darkest pixels of the photograph are as bright as expected, and its
+    sd.
+    """
     import cv2
 
     way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
@@ -295,17 +304,17 @@ def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float
 def _check_orientation(
     photo: np.ndarray, wanted: np.ndarray, scale: float, pitch_sd: float, asked: str, photo_file: str | Path
 ) -> list[str]:
-    """Other orientations that fit as well as the one asked for.
+    """Return other orientations that fit as well as the one asked for.
 
     Raises:
-        InputError: another one fits better, or none fits.
+        InputError: another orientation fits better, or none fits.
     """
     import cv2
 
     shrink = max(1, wanted.shape[0] // _SMALL_PX)
     side = wanted.shape[0] // shrink
     small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
-    # The photograph is brought to the same pixels; otherwise its noise would decide.
+    # The photograph is averaged to the pixels of the expected image; otherwise its noise would decide.
     finer = max(1, round(wanted.shape[0] / side / scale))
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]
@@ -344,7 +353,7 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
     median = cv2.medianBlur(lit.astype(np.float32), 3)
     difference = lit - median
     spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
-    # So that no hot pixel decides what is bright.
+    # The median, so that no hot pixel decides what is bright.
     bright = float(median.max())
     outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
     return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())
@@ -365,7 +374,9 @@ class _Fit:
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
-    """The camera whose photograph of the expected image is closest; ``further``: fit tilt and light too."""
+    """Fit the camera whose photograph of the expected image is closest; with ``further``, fit tilt and light
+    too.
+    """
     import cv2
 
     side, blur_px = wanted.shape[0], 2 * max(1.0, scale)
@@ -385,7 +396,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     free = [0, 1, 2] + ([3] if pitch_sd else [])
     # A unit of angle (sine), log scale or tilt moves the edge as much as a shift of half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
-    # Residuals of neighbours are not independent: this many pixels count as one.
+    # Residuals of neighbouring pixels are not independent: this many pixels count as one.
     alike = 4 * math.pi * blur_px**2
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -411,7 +422,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         at[columns] += found.x * unit[columns]
         return at, found
 
-    # From coarse to fine, because the fine structure of an image has maxima beside the right one.
+    # The fit goes from coarse to fine, because the fine structure of an image has false maxima beside the
+    # right one.
     for more in (4 * blur_px, 0.0):
         images = smooth, fixed
         if more:
@@ -439,10 +451,11 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
 
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
-    """Covariance of a least-squares fit with correlated neighbours, from the scatter between tiles.
+    """Return the covariance of a least-squares fit with correlated neighbours, from the scatter between
+    tiles.
 
-    A print unlike the expected one is displaced differently from place to place (White 1980; one tile is one
-    observation).
+    A print unlike the expected one is displaced differently from place to place, so each tile counts as one
+    observation (White 1980).
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
     number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
@@ -475,7 +488,9 @@ def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, fl
 
 
 def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
-    """Map (3, 3) from window to photograph pixels of a camera: shift (px), turn, log scale, two tilts."""
+    """Return the map (3, 3) from window to photograph pixels for a camera's shift (px), turn, log scale and
+    two tilts.
+    """
     turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
     centre = (np.array(shape[1::-1]) - 1) / 2
     cos, sin = size * math.cos(turn), size * math.sin(turn)
@@ -486,7 +501,7 @@ def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -
 
 
 def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
-    """The pixels of the window (side, side) that lie on the photograph."""
+    """Return a mask of the window pixels (side, side) that lie on the photograph."""
     import cv2
 
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
@@ -494,7 +509,7 @@ def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
 
 
 def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
-    """Squared distance from the middle of a photograph, 1 in its corners."""
+    """Return the squared distance from the middle of a photograph, 1 in its corners."""
     y, x = (np.linspace(-1, 1, size) for size in shape)
     return (y[:, None] ** 2 + x**2) / 2
 

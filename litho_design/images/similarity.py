@@ -10,24 +10,27 @@ SSIM_WINDOW_PX = 11
 
 
 def matched_scale(image: Tensor, target: Tensor) -> Tensor:
-    """The factor c = sum(I T) / sum(I^2) that brings ``image`` closest to ``target``."""
+    """Return the factor c = sum(I T) / sum(I^2) that brings ``image`` closest to ``target``."""
     return (image * target).sum() / image.square().sum().clamp(min=torch.finfo(image.dtype).tiny)
 
 
 def si_psnr_db(image: Tensor, target: Tensor) -> float:
-    """-10 log10 mean((c I - T)^2): unchanged by any scale of the image; peak is 1 by definition."""
+    """Return -10 log10 mean((c I - T)^2), which does not depend on the scale of the image; its peak is 1 by
+    definition.
+    """
     error = (matched_scale(image, target) * image - target).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-30)))
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted light."""
+    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted light.
+    """
     average = (image * target).sum() / target.sum()
     return (image / average - target).square().mean().sqrt()
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Structural similarity of two images in [0, 1], the mean of ``ssim_map``.
+    """Return the structural similarity of two images in [0, 1], the mean of ``ssim_map``.
 
     Windows that reach over the edge do not count.
     """
@@ -37,7 +40,9 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Structural similarity at each pixel of images in [0, 1]: window 11, sigma 1.5 (Wang et al. 2004)."""
+    """Return the structural similarity at each pixel of images in [0, 1]: window 11, sigma 1.5 (Wang et al.
+    2004).
+    """
     from skimage.metrics import structural_similarity
 
     found: np.ndarray = structural_similarity(
@@ -53,7 +58,9 @@ def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
-    """SI-PSNR and SSIM of an image (m, m) against its target and the target at the element's resolution."""
+    """Return SI-PSNR and SSIM of an image (m, m) against its target, and against the target at the element's
+    resolution.
+    """
     figures = {}
     for name, wanted in (("", target), ("_resolved", resolved)):
         scaled = matched_scale(image, wanted) * image
@@ -63,7 +70,8 @@ def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float
 
 
 def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
-    """``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME`` of an estimate (n, n) of an object (n, n) in [0, 1].
+    """Return ``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME`` of an estimate (n, n) of an object (n, n) in
+    [0, 1].
 
     PSNR and SSIM clip the estimate to that range.
     """
@@ -77,7 +85,7 @@ def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
 
 
 def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
-    """Shares of the light of an image (m, m), and its uniformity; the signal is {T > 0.5}."""
+    """Return the shares of light in an image (m, m) and its uniformity; the signal is {T > 0.5}."""
     lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
     return {

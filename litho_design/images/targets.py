@@ -1,4 +1,4 @@
-"""Wanted images: drawn by code, or read from a picture, in [0, 1] on a square grid."""
+"""Draw wanted images by code, or read them from pictures: values in [0, 1] on a square grid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from litho_data.foundation.results import Record
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
-# Rows drawn at a time, because a large picture in double precision takes more memory than its design.
+# Number of rows drawn at a time, because a large picture in double precision takes more memory than its
+# design.
 _ROWS = 256
 
 
@@ -29,21 +30,22 @@ class TargetRecord(Record):
 
     @classmethod
     def of_file(cls, path: Path, notes: Sequence[str]) -> TargetRecord:
-        """A file, and what was done to it, one phrase each."""
+        """Record a file and its conversions, one phrase each."""
         return cls(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
 
     @classmethod
     def of_array(cls, name: str, pixels: np.ndarray, unit: str) -> TargetRecord:
-        """A drawing or an array (ny, nx), used as it is."""
+        """Record a drawing or an array (ny, nx) that is used unchanged."""
         return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
-# An object of a lens: a drawing by its name, or a picture, whose pixels are kept beside the settings.
+# The object of a lens: the name of a drawing, or the record of a picture, whose pixels are stored with the
+# settings.
 ImagedObject = str | TargetRecord
 
 
 def object_name(item: ImagedObject) -> str:
-    """Name of the drawing, or of the picture's file."""
+    """Return the name of the drawing or of the picture's file."""
     return item if isinstance(item, str) else item.name
 
 
@@ -56,7 +58,7 @@ class Target:
 
 
 def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Target:
-    """A wanted image of ``size_px`` by name of a drawing, by path of a picture, or from an array.
+    """Load a wanted image of ``size_px``: a drawing by name, a picture by path, or an array.
 
     Args:
         source: text, ring, chart, spots or letters; an image file, whose grey values are fitted to the
@@ -81,10 +83,13 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:
-    """Width of the strokes of a target (size, size) in [0, 1], px: the median along their middle lines."""
+    """Return the stroke width of a target (size, size) in [0, 1], px: the median width along the middle lines
+    of its strokes.
+    """
     import cv2
 
-    # At twice the size, even widths have a middle pixel, too; its distance to the dark is the width.
+    # At twice the size, strokes of even width also have a middle pixel; its distance to the dark is the
+    # width.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
     middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))
@@ -111,7 +116,7 @@ def _text(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _letters(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Rows of small letters and digits: fine detail in many directions."""
+    """Draw rows of small letters and digits: fine detail in many directions."""
     return _words(y, ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
 
 
@@ -135,7 +140,7 @@ def _ring(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Bars of four widths, along and across, and a spoke target."""
+    """Draw bars of four widths, along and across, and a spoke target."""
     picture = np.zeros_like(x)
     for index, width in enumerate((0.032, 0.024, 0.016, 0.01)):
         top = -0.36 + 0.19 * index
@@ -153,7 +158,7 @@ def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A 7 x 7 fan-out without its centre."""
+    """Draw a 7 x 7 fan-out without its centre."""
     picture = np.zeros_like(x)
     for row in range(-3, 4):
         for column in range(-3, 4):
@@ -163,7 +168,8 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
-    """A picture in grey (ny, nx), with the values of its file, and the conversions, one phrase each.
+    """Read a picture in grey (ny, nx), with the values of its file; also return the conversions, one phrase
+    each.
 
     Raises:
         InputError: no file, or not a readable image.
@@ -186,7 +192,7 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
 
 
 def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
-    """A picture in grey on a black square, divided by its brightest value.
+    """Read a picture in grey onto a black square, divided by its brightest value.
 
     Args:
         path: any format and bit depth that OpenCV reads; grey values are taken as brightness.

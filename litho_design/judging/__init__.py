@@ -1,1 +1,1 @@
-"""Scores of a finished design: as predicted by models, as measured, as photographed."""
+"""Score a finished design as models predict it, as an AFM measures it, or as a camera photographs it."""

@@ -1,4 +1,4 @@
-"""The design-to-manufacturing gap: the designs of every arm and seed, as printed by every judge."""
+"""Records of the design-to-manufacturing gap: the designs of every arm and seed, printed by every judge."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class GapEntry(Record):
 
 
 class GapSummary(Record):
-    """One figure of one arm under one judge: mean over seeds with its 95 % interval."""
+    """One figure of one arm under one judge: its mean over seeds with a 95 % interval."""
 
     arm: str
     judge: str
@@ -46,7 +46,7 @@ class GapSummary(Record):
 
 
 class PairedDifference(Record):
-    """One figure of one arm minus that of another under the same judge, paired by seed."""
+    """The difference of one figure between two arms under the same judge, paired by seed."""
 
     judge: str
     figure: str
@@ -63,7 +63,7 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # In order of the number of fields; a task of your own has the fields common to all designs.
+    # The types are in order of their number of fields; your own task has the fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
@@ -75,12 +75,12 @@ class GapResult(RunFacts, Result):
 
 
 def design_folder(out: Path, arm: str, seed: int) -> Path:
-    """Folder of the design of one arm and seed."""
+    """Return the folder of the design of one arm and seed."""
     return out / DESIGNS / arm / f"seed{seed}"
 
 
 def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
-    """Mean, interval and gap of every figure for every arm and judge."""
+    """Return the mean, interval and gap of every figure for every arm and judge."""
     summary = []
     for (arm, judge), group in _grouped(entries).items():
         for figure in group[0].judged:
@@ -102,7 +102,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """The given figures of every arm minus those of every other arm, under each judge."""
+    """Return the differences of the given figures between every two arms, under each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))
@@ -121,7 +121,7 @@ def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> l
 
 
 def interval95(values: np.ndarray) -> tuple[float, float] | None:
-    """Student's t interval of the mean; None for a single value."""
+    """Return Student's t interval of the mean; None for a single value."""
     if len(values) < 2:
         return None
     from scipy.stats import t

@@ -1,4 +1,4 @@
-"""A finished design, read back from its folder, for any judge to print and score."""
+"""Read a finished design back from its folder, so that any judge can print and score it."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from litho_design.tasks.task import Task, registered_task
 
 
 class LoadedDesign:
-    """The layout of a design folder, its optics and its scores, whatever its task.
+    """The layout of a design folder with its optics and scores, whatever the task.
 
     Attributes:
         folder: folder of the design.
         record: what ``design.json`` holds.
         level: layout (size, size).
         expected_um: height (size, size), µm, of the print that the design expects.
-        task: what it was designed for.
+        task: what the layout was designed for.
         target: wanted image (size, size) of a hologram; None for other tasks.
         bench: the optics, from a height map to an image or a PSF.
 
@@ -81,7 +81,7 @@ class LoadedDesign:
         self.target: Tensor | None = getattr(self.task, "target", None) if whole else None
 
     def _task(self, band_px: int | None) -> Task:
-        """The task of the design. It only scores, so it needs a device but no model."""
+        """Return the task of the design. The task only scores, so it needs a device but no model."""
         record, kind = self.record, registered_task(self.record.task)
         nominal = Printer(None, record.layout, source="none").to(self.device)
         made: Any = kind.settings_type.model_validate(record.settings)
@@ -110,7 +110,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
-        """Height (size, size), µm, of the layout as printed by ``judge``."""
+        """Return the height (size, size), µm, of the layout as printed by ``judge``."""
         self.task.check_printer(judge)
         return self.task.printed_um(self.level, judge)
 
@@ -120,21 +120,21 @@ class LoadedDesign:
         return self.bench(height_um).cpu().numpy()
 
     def score(self, height_um: Tensor) -> Record:
-        """Score of a print (size, size), µm."""
+        """Return the score of a print (size, size), µm."""
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """The image as reports show it: scaled to its target; for a PSF, the root of PSF over peak."""
+        """Scale an image to its target, as reports show it; for a PSF, take the root of PSF over peak."""
         return self.task.display(image)
 
     @property
     def window_um(self) -> float:
-        """Side of the image or of the PSF window, µm."""
+        """Return the side of the image or of the PSF window, µm."""
         return self.bench.window.size_um[0]
 
     @property
     def frame_um(self) -> float:
-        """Side of a lens's objects, or of the image of another task, µm."""
+        """Return the side of a lens's objects, or of the image of another task, µm."""
         if not isinstance(self.task, LensTask):
             return self.window_um
         imaging = self.task.settings.imaging
@@ -145,7 +145,7 @@ class LoadedDesign:
 
 
 def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> LoadedDesign:
-    """The finished design in ``folder``, ready to be printed and scored on ``device``.
+    """Return the finished design in ``folder``, ready to be printed and scored on ``device``.
 
     Raises:
         InputError: what ``LoadedDesign`` refuses.

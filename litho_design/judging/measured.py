@@ -1,4 +1,4 @@
-"""A measured height map of the printed part: levelled, and registered onto its layout."""
+"""Level a measured height map of the printed part, and register it onto its layout."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
-# With fewer measured pixels the score would describe the filled-in part more than the print.
+# With fewer measured pixels the score would describe mainly the filled-in part, not the print.
 _SMALLEST_COVERAGE = 0.8
 # Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# Dust is higher than random errors of a print, and wider than a step.
+# Dust is higher than random errors of a print and wider than a step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# This share of the change by a tip remains uncertain.
+# This share of the change that the tip causes remains uncertain.
 _TIP_SD = 0.3
 
 
 class MeasuredRecord(Record):
-    """The scan, its agreement with the expected print, and how it was processed.
+    """The scan, its agreement with the expected print, and its processing.
 
-    ``orientation`` is the operation that brings the scan onto the layout. ``tilt_um_per_um`` (x, y) and
-    ``bow_um``, the range of the curved part over the element, were removed; ``noise_um`` is the remainder at
-    frequencies that no print has. ``defect_share`` is the share of the element that shows dust or scars
-    instead of the print.
+    ``orientation`` is the operation that turns the scan onto the layout. ``tilt_um_per_um`` (x, y) and
+    ``bow_um``, the range of the curved part over the element, were removed. ``noise_um`` is the residual at
+    frequencies at which no print has structure. ``defect_share`` is the share of the element that shows dust
+    or scars instead of the print.
     """
 
     name: str
@@ -58,7 +58,7 @@ class MeasuredRecord(Record):
     tip_change_um: float
 
     def remarks(self) -> list[str]:
-        """Remarks on what was removed and on the orientation of the scan, one phrase each."""
+        """Return remarks on what was removed and on the orientation of the scan, one phrase each."""
         found = [] if not self.warning else [self.warning]
         found += ["the scan was taken as it is, without registration"] if self.aligned else []
         if self.orientation != "identity":
@@ -81,12 +81,12 @@ class MeasuredRecord(Record):
 
 
 def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor, MeasuredRecord]:
-    """The measured height of a printed design on its layout's pixels.
+    """Resample the measured heights of a printed design onto the pixels of its layout.
 
-    The zero of an AFM map is arbitrary, and a constant height is only a constant phase, so the zero is set to
-    make the medians of measured and designed print agree. Tilt and bow of the scanner are fitted together
-    with the designed print, so that they remove nothing of its own shape. Unmeasured pixels take their value
-    from the designed print.
+    The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
+    set so that the medians of measured and designed print agree. Tilt and bow of the scanner are fitted
+    together with the designed print, so that nothing of its own shape is removed. Unmeasured pixels take
+    their values from the designed print.
 
     Args:
         loaded: the design.
@@ -157,7 +157,9 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """A scan without the widening by its tip, the radius of the tip, and the rms change of heights, µm."""
+    """Remove the widening by the tip from a scan; return the scan, the tip's radius and the rms change of
+    heights, µm.
+    """
     from litho_data.tip import estimate_tip, paraboloid_erosion
 
     radius_um = tip_um
@@ -174,12 +176,14 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 
 
 def _defects(off_um: np.ndarray) -> np.ndarray:
-    """Dust and scars in the deviation of a print (ny, nx) from its expectation, µm, without tilt and bow."""
+    """Return a mask of dust and scars, from the deviation of a print (ny, nx) from its expectation, µm, free
+    of tilt and bow.
+    """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     from litho_data.level.scars import mark_scars
 
-    # Steps displaced by a pixel deviate up on one side and down on the other, so a blur removes them.
+    # A step displaced by a pixel deviates up on one side and down on the other, so a blur removes it.
     smooth = gaussian_filter(off_um, _DUST_BLUR_PX)
     middle = np.median(smooth)
     spread = 1.4826 * float(np.median(np.abs(smooth - middle)))
@@ -190,7 +194,7 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
 
 class _Placed(NamedTuple):
-    """A scan on the pixels of the layout (ny, nx): heights, measured pixels, transform, uncertainties."""
+    """A scan on the pixels of the layout (ny, nx): heights, measured pixels, transform and uncertainties."""
 
     height_um: np.ndarray
     valid: np.ndarray
@@ -231,7 +235,8 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan: their map (ny, nx), µm, without its mean; slopes (x, y); range of the bow."""
+    """Tilt and bow of a scan: a map (ny, nx), µm, of zero mean, its slopes (x, y), and the range of the bow.
+    """
 
     map_um: np.ndarray
     tilt_um_per_um: tuple[float, float]
@@ -241,7 +246,7 @@ class Background:
 def fitted_background(
     height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
 ) -> Background:
-    """Tilt and bow of a scan (ny, nx), by least squares together with a gain of the expected print."""
+    """Fit tilt and bow of a scan (ny, nx) by least squares, together with a gain of the expected print."""
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
@@ -261,7 +266,7 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Prints (ny, nx), µm, that are as plausible: with other noise, position, scale of heights and tip."""
+    """Yield equally plausible prints (ny, nx), µm, with other noise, position, height scale and tip."""
     from scipy.ndimage import shift
 
     from litho_data.tip import paraboloid_erosion

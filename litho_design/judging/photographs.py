@@ -1,4 +1,4 @@
-"""Photographs as judges: of a hologram's image, or of a known object through a printed lens."""
+"""Score photographs: of a hologram's image, or of a known object through a printed lens."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 
 # A score with a larger standard deviation cannot decide between designs.
 _LARGEST_SD_DB = 0.5
-# This share of the change by a blur of the camera remains uncertain.
+# This share of the change that a blur of the camera causes remains uncertain.
 _BLUR_SD = 0.3
 
 
 class PhotoScore(Record):
-    """Figures of a photographed image; efficiencies only if the incident power is known."""
+    """The figures of a photographed image; it has efficiencies only if the incident power is known."""
 
     si_psnr_db: float
     ssim: float
@@ -46,10 +46,11 @@ class PhotoScore(Record):
 
 
 class LensPhotoScore(Record):
-    """Error, PSNR and SSIM of one photographed object, each image at the scale of least error.
+    """Error, PSNR and SSIM of one photographed object; each image is scaled to minimise its error.
 
-    ``direct`` is the photograph itself, ``design`` its deconvolution with the PSF that the design expected,
-    ``calibrated`` its deconvolution with the PSF of the measured print (None without a measurement).
+    ``direct`` is the photograph itself. ``design`` is its deconvolution with the PSF that the design
+    expected, and ``calibrated`` its deconvolution with the PSF of the measured print (None without a
+    measurement).
     """
 
     mae_direct: float
@@ -65,7 +66,8 @@ class LensPhotoScore(Record):
 
 @dataclass(frozen=True)
 class PhotoVerdict:
-    """Figures of a photograph with their uncertainties, its record, and pictures by title."""
+    """The figures of a photograph with their uncertainties, the photograph's record, and pictures by title.
+    """
 
     figures: Record
     uncertainty: dict[str, float]
@@ -100,7 +102,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     image = photo.image()
     freed, uncertainty = freed_of_noise(figures, figures(image), photo.as_it_might_be())
     # A blur beyond the expected image may come from the camera or the print, so part of its effect stays
-    # open.
+    # uncertain.
     sharp, soft = (
         photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
         for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
@@ -126,7 +128,9 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Figures of a registered photograph (m, m) against its target and the target at its resolution."""
+    """Return the figures of a registered photograph (m, m) against its target, and against the target at its
+    resolution.
+    """
     share = torch.from_numpy(image).double()
     found = likeness(share, target, resolved) | light_figures(share, target)
     known = {name: value for name, value in found.items() if has_power or not name.startswith("eff_")}
@@ -139,9 +143,10 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    ``photographed_image`` cleans the photograph and registers it on the image that the design expects of the
-    object, on the design's sensor pixels. Then it is deconvolved by Richardson-Lucy with the design's number
-    of iterations. The image of the object must have the size of the design's image, or the PSFs do not fit.
+    ``photographed_image`` cleans the photograph and registers it on the sensor pixels of the image that the
+    design expects of this object. Then the photograph is deconvolved by Richardson-Lucy with the design's
+    number of iterations. The image of the object must be as large as in the design, otherwise the PSFs do not
+    fit.
 
     Args:
         loaded: a lens's design.
@@ -190,7 +195,7 @@ def score_lens_photo(
 
 
 def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
-    """The object of a photograph, (n, n) in [0, 1], and its name or record."""
+    """Return the object of a photograph, (n, n) in [0, 1], and its name or record."""
     settings = task.settings.imaging
     items = (*settings.objects, *settings.test_objects)
     names = [object_name(item) for item in items]

@@ -1,4 +1,5 @@
-"""Scores of a design as printed by models, measured or photographed; always of the printable layout."""
+"""Score a design as models print it, as measured or as photographed; the layout is always the printable one.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Remarks on how a measurement was processed and what is uncertain about it, one phrase each."""
+        """Return remarks on how a measurement was processed and what is uncertain about it, one phrase each.
+        """
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
@@ -67,12 +69,12 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
-    # Gain of the design over doing nothing, if it was compared with that.
+    # Gain of the design over doing nothing, if the score compared them.
     gain: float | None = None
 
     @classmethod
     def of(cls, folder: Path, record: Design, scores: list[JudgedScore]) -> ScoreResult:
-        """The result of this run for the design in a folder."""
+        """Make the result of this run for the design in a folder."""
         return cls(
             **run_facts(),
             design=str(folder),
@@ -114,7 +116,7 @@ def judge_design(
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
 ) -> Judgement:
-    """Score the layout of a design as printed by models, as measured, and as photographed.
+    """Score the layout of a design as models print it, as measured, and as photographed.
 
     Args:
         judges: printers; those with the weights of the design's own model are marked as not independent.
@@ -163,7 +165,7 @@ def judge_design(
 
 
 def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
-    """The figures of a predicted or measured print, and its height minus the designed one."""
+    """Score a predicted or measured print; also return its height minus the designed height."""
     figures, spread = loaded.score(height), None
     measured = isinstance(judge, MeasuredRecord)
     if isinstance(judge, MeasuredRecord):

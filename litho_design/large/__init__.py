@@ -1,1 +1,1 @@
-"""Elements larger than one process: in bands of rows, shared among processes."""
+"""Design elements that exceed one process: in bands of rows, shared among processes."""

@@ -1,7 +1,7 @@
-"""Bands of rows, the unit in which a large element is printed and transformed.
+"""Bands of rows, in which a large element is printed and transformed.
 
 The bands depend only on the layout: an element has the same bands with the same numbers, whether one process
-computes them or many.
+or many compute them.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from litho_data.foundation.errors import InputError
 from litho_design.optimisation.ranks import ALONE, Ranks
 from litho_design.printers.printer import Printer
 
-# Most rows of a band. Memory for a print grows with their square, and an element cannot be shared by more
-# processes than it has bands. Below about four times the model's reach, most of the time goes into rows that
-# are printed twice.
+# Maximum number of rows of a band. The memory of a print grows with the square of this number, and an element
+# cannot be shared by more processes than it has bands. If a band is narrower than about four times the
+# model's reach, most of the time is spent on rows that are printed twice.
 BAND_PX = 512
 
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a square element, and those of this process.
+    """The bands of a square element, and which of them this process holds.
 
     Args:
         size_px: side of the element.
@@ -51,27 +51,27 @@ class Bands:
 
     @property
     def band_px(self) -> int:
-        """Rows of every band but the last."""
+        """Return the number of rows of every band but the last."""
         count = -(-self.size_px // self.most_px)
         return -(-self.size_px // (count * self.cell_px)) * self.cell_px
 
     @property
     def count(self) -> int:
-        """Number of bands of the element."""
+        """Return the number of bands of the element."""
         return -(-self.size_px // self.band_px)
 
     def rows(self, rank: int | None = None) -> range:
-        """The rows of the element that a process holds, by default this one."""
+        """Return the rows of the element that a process holds; the default is this process."""
         own = self.ranks.share(self.count, rank)
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
     def own(self) -> list[slice]:
-        """The bands of this process, as slices of its own rows."""
+        """Return the bands of this process as slices of the rows that it holds."""
         rows = len(self.rows())
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 
     def check_halo(self, halo: int) -> None:
-        """Refuse bands so narrow that a row lies in the halos of two other bands.
+        """Refuse bands so narrow that a row would lie in the halos of two other bands.
 
         Raises:
             InputError: fewer rows than twice the halo, or than the halo in the last band.
@@ -86,12 +86,13 @@ class Bands:
             )
 
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
-        """The own rows (rows, x) with ``halo`` rows of the neighbours on both sides, zero beyond the element.
+        """Return the rows of this process (rows, x) with ``halo`` rows of both neighbours, zero beyond the
+        element.
 
-        At most two bands contribute to the gradient of a row, so the sum is the same in any order.
+        At most two bands contribute to the gradient of a row, so the order of summation does not matter.
         """
         rank, count = self.ranks.rank, self.ranks.count
-        # The neighbour above needs the first rows, the one below the last.
+        # The neighbour above needs the first rows, the neighbour below the last.
         ends = {rank - 1: values[:halo], rank + 1: values[len(values) - halo :]}
         parts = [ends.get(other, values[:0]) for other in range(count)]
         sizes = [part.numel() for part in parts]

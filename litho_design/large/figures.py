@@ -1,6 +1,6 @@
-"""Figures of an image of any size, in memory or on disk, a band of rows at a time.
+"""Score an image of any size, in memory or on disk, one band of rows at a time.
 
-They have the names and meanings of ``HologramScore``; those that need the whole image at once (camera,
+The figures have the names and meanings of ``HologramScore``. Those that need the whole image at once (camera,
 resolved target, uniformity) are left out.
 """
 
@@ -15,7 +15,9 @@ from litho_design.large.bands import Bands
 
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
-    """Figures of an image (size, size), share of the incident power, against its target in [0, 1]."""
+    """Return the figures of an image (size, size), in shares of the incident power, against its target in [0,
+    1].
+    """
     sums = np.sum([_sums(*_read(image, target, band)) for band in bands.own()], axis=0)
     lit, signal, lit_square, dark, paper, power, square, both, wanted, wanted_square = sums.tolist()
     pixels, mean = bands.size_px**2, signal / lit
@@ -39,7 +41,7 @@ def _read(image: np.ndarray, target: np.ndarray, rows: slice) -> tuple[np.ndarra
 
 
 def _sums(share: np.ndarray, aim: np.ndarray) -> list[float]:
-    """The sums over a band of rows from which figures of the whole image follow."""
+    """Return sums over a band of rows, from which the figures of the whole image are computed."""
     bright = aim > 0.5
     lit = share[bright]
     maps = lit, lit**2, share[~bright], share[aim > 0], share, share**2, share * aim, aim, aim**2
@@ -47,7 +49,7 @@ def _sums(share: np.ndarray, aim: np.ndarray) -> list[float]:
 
 
 def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands) -> tuple[float, float]:
-    """SSIM at the matched scale, and the share of pixels that it clips."""
+    """Return the SSIM at the matched scale, and the share of pixels that this scale clips."""
     around = SSIM_WINDOW_PX // 2
     size, total, clipped = bands.size_px, 0.0, 0
     for band in bands.own():
@@ -55,7 +57,7 @@ def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands)
         seen, aim = _read(image, target, slice(first, last))
         seen *= scale
         clipped += int((seen[band.start - first : band.stop - first] > 1).sum())
-        # Windows that extend over the edge of the element do not count.
+        # Windows that extend beyond the edge of the element do not count.
         inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
         total += float(ssim_map(seen.clip(0, 1), aim)[inner, around : size - around].sum())
     return total / (size - 2 * around) ** 2, clipped / size**2

@@ -1,4 +1,4 @@
-"""A hologram in bands: the task of a hologram in one piece, restricted to the rows of this process."""
+"""The task of a hologram in bands: like a hologram in one piece, but limited to the rows of this process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LEFT_OUT = (
     "need the whole image at once are left out"
 )
 _PREVIEW_PX = 1024
-# A large element supports only these values of these settings: for its light, and for its search.
+# Settings of light and of search, with the only values that a large element supports.
 LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
@@ -51,10 +51,10 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 
 
 class BandedHologram(HologramTask):
-    """A hologram whose rows are shared by several processes; each computes the loss of the whole.
+    """A hologram whose rows are shared by several processes; each process computes the loss of the whole.
 
-    All processes run it with the same arguments and share the file system of the folder. The layout does not
-    depend on their number.
+    All processes run this task with the same arguments and share the file system of the folder. The resulting
+    layout does not depend on their number.
 
     Args:
         settings: settings of the hologram; those of its search are checked by ``only``.
@@ -96,44 +96,48 @@ class BandedHologram(HologramTask):
         self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
-        """The bands are included, because they decide the rounding of sums and so the layout."""
+        """Return the hash of inputs and bands. The bands are included because they decide the rounding of
+        sums and so the layout.
+        """
         return f"bands of {self.bands.band_px}"
 
     def make_cells(self) -> CellMap:
-        """The cells of the own rows."""
+        """Return the cells of the rows of this process."""
         return CellMap(self.settings.layout, self.bands.rows())
 
     def make_bench(self, optics: Optics) -> Any:
-        """The bench from the element to the own rows of the image plane."""
+        """Return the bench from the element to the rows of the image plane that this process holds."""
         return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Height of the own rows, µm."""
+        """Return the height of the rows of this process, µm."""
         halo = printer.halo_px
         around = F.pad(self.bands.with_halo(level[0, 0], halo), (halo, halo))
         return printer.print_in_tiles(around[None, None], self.bands.band_px)[0, 0]
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of the whole element and its parts, from the own levels (1, 1, rows, size)."""
+        """Return the loss of the whole element and its parts, from the levels of this process (1, 1, rows,
+        size).
+        """
         loss, parts = super().objective(level)
         # Every process has the whole loss, but the gradient must count it once.
         return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Any:
-        """Figures of a print (size, size), µm, of an element in one process."""
+        """Return the figures of a print (size, size), µm, of an element in one process."""
         figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
         wave = element_field(height_um, self.bench.grid, self.settings.optics)
         return Figures(**figures, zero_order_share=zero_order_share(wave))
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays that all processes share; only the first process gets the hashes."""
+        """Write the arrays that all processes share; only the first process receives the hashes."""
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Figures of the whole element, from disk."""
+        """Compute the figures of the whole element from disk."""
         levels, seen, aim = (
             np.load(folder / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )
@@ -144,7 +148,7 @@ class BandedHologram(HologramTask):
         )
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """The image over its brightest value, reduced to 1,024 px a side at most."""
+        """Divide the image by its brightest value, and reduce it to at most 1,024 px a side."""
         import cv2
 
         side = min(len(seen), _PREVIEW_PX)
@@ -153,7 +157,7 @@ class BandedHologram(HologramTask):
 
 
 class BandedBench(nn.Module):
-    """Light of one plane wave through the own rows of an element onto the own rows of the image plane."""
+    """Propagate one plane wave through the rows of this process onto its rows of the image plane."""
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: torch.device):
         super().__init__()
@@ -165,7 +169,9 @@ class BandedBench(nn.Module):
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Share of the incident power on the own pixels (rows, size), from the own heights, µm."""
+        """Return the share of the incident power on the pixels (rows, size) of this process, from its
+        heights, µm.
+        """
         field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
         return intensity_share(self.propagator(field), self.rows)
 
@@ -186,7 +192,9 @@ def only(settings: Record, values: dict[str, Any]) -> None:
 
 
 def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
-    """Write arrays from the own rows (rows, size) of each process; SHA-256 by file name in the first."""
+    """Write arrays from the rows (rows, size) of each process; the first process returns their SHA-256 by
+    file name.
+    """
     size, rows, hashes = bands.size_px, bands.rows(), {}
     for name, values in arrays.items():
         own = values.cpu().numpy()

@@ -1,6 +1,7 @@
-"""A lens of any size, ring by ring: a strip along one radius is printed, and a wave of rings propagated.
+"""Design a lens of any size ring by ring: a strip along one radius is printed, and a wave of rings
+propagated.
 
-The plane is never computed: an element of 10 mm is 50,000 rings of 0.1 µm, not 10¹⁰ pixels.
+The plane is never computed, because an element of 10 mm has 10¹⁰ pixels but only 50,000 rings of 0.1 µm.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from litho_design.tasks.task import Task
 
 
 class RadiusMap(CellMap):
-    """Free rings along one radius, (..., rings) to (..., pixels): ``CellMap`` for less than a plane."""
+    """Map free rings to the pixels of one radius, (..., rings) to (..., pixels): a ``CellMap`` for a radius
+    instead of a plane.
+    """
 
     area: Tensor
 
@@ -42,7 +45,7 @@ class RadiusMap(CellMap):
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Mean over the area of each ring of real or complex ``pixels`` along the radius."""
+        """Return the mean over the area of each ring of real or complex ``pixels`` along the radius."""
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
         return sums[0] / sums[1]
@@ -75,38 +78,42 @@ class RingLens(DirectLensTask):
         require_reach(printer)
 
     def inputs_sha256(self) -> str:
-        """Constant: nothing but the settings decides the layout."""
+        """Return a constant, because nothing but the settings decides the layout."""
         return "rings"
 
     def make_cells(self) -> CellMap:
-        """From rings to pixels of the radius."""
+        """Return the map from rings to pixels of the radius."""
         return RadiusMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """The bench along the radius."""
+        """Return the bench along the radius."""
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """The same bench, whose matrix takes time to compute: only the lens as modelled is searched."""
+        """Return the same bench again, because its matrix takes time to compute; only the lens as modelled is
+        searched.
+        """
         return self.bench
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels whose print is nearest to a perfect lens."""
+        """Return the levels whose print is nearest to a perfect lens."""
         ideal = self.bench.ideal_height_um().double() * (2 * math.pi / self.settings.optics.wave_height_um)
         wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
         return focusing_levels(wave.angle().float().cpu(), level_phase.cpu())
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Printed height, µm (rings of a pixel,), of levels along the radius (1, 1, pixels)."""
+        """Return the printed height, µm, of each pixel of the radius, from levels along the radius (1, 1,
+        pixels).
+        """
         rings = self.cells.average(level[0, 0])
         strip = rings[strip_rings(self.settings.layout, printer.halo_px, len(rings))]
         return printer.print_in_tiles(strip[None, None], self.tile_px)[0, 0].mean(0)
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Levels and heights along the radius."""
+        """Return levels and heights along the radius."""
         levels = level.cpu().numpy().astype(np.uint8)
         return {RINGS_FILE: levels, RING_HEIGHT_FILE: height_um.cpu().numpy()}
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Figures along the radius."""
+        """Return the figures along the radius."""
         return Findings(predicted=self.score(height_um).model_dump(), baselines=self.baselines())

@@ -1,8 +1,8 @@
-"""Propagation of a wave to a parallel plane by a Fourier transform that several processes share.
+"""Propagate a wave to a parallel plane by a Fourier transform that several processes share.
 
-Rows are transformed where they lie; one exchange gives every process whole columns; these are transformed,
-multiplied and transformed back, and a second exchange returns the rows (Takahashi, Fast Fourier Transform
-Algorithms for Parallel Computers, ch. 8: the transposed form of the two-dimensional transform).
+Each process transforms its own rows. One exchange then gives every process whole columns, which it
+transforms, multiplies and transforms back. A second exchange returns the rows (Takahashi, Fast Fourier
+Transform Algorithms for Parallel Computers, ch. 8: the transposed form of the two-dimensional transform).
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """Like ``make_propagator`` between equal grids, for a field whose bands of rows are shared.
+    """A propagator like that of ``make_propagator`` between equal grids, for a field whose bands of rows are
+    shared.
 
     Field and result are the rows of this process, complex64 (rows, size). The kernel is even along both axes,
     so only half of each column of its transform is kept.
@@ -62,11 +63,11 @@ class BandedPropagator:
         return carried
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """P^H of the propagation, which sends a field back."""
+        """Apply P^H, the adjoint of the propagation, which sends a field back."""
         return self.carried(field, conjugate=True)
 
     def carried(self, field: Tensor, *, conjugate: bool = False) -> Tensor:
-        """The propagation (or its adjoint) of the own rows; nothing is recorded for gradients."""
+        """Propagate the rows of this process forward or by the adjoint, without recording gradients."""
         size, carried = self.bands.size_px, torch.empty_like(field)
         columns = self._to_columns(lambda band: field[band])
         for block in self._blocks:
@@ -96,7 +97,7 @@ class BandedPropagator:
         return got.reshape(bands.size_px, width)
 
     def _to_rows(self, columns: Tensor) -> Tensor:
-        """The inverse exchange: (size, own columns) to (own rows, length)."""
+        """Reverse the exchange: (size, own columns) to (own rows, length)."""
         bands, ranks = self.bands, self.bands.ranks
         if ranks.count == 1:
             return columns
@@ -114,10 +115,12 @@ class BandedPropagator:
         return self._starts[rank + 1] - self._starts[rank]
 
     def _kernel_transfer(self, optics: Optics) -> None:
-        """The transform of the Rayleigh-Sommerfeld kernel: rows in double, then columns in double."""
+        """Compute the transform of the Rayleigh-Sommerfeld kernel in double precision, first along rows, then
+        along columns.
+        """
         pitch, size = self.source.pitch_um[0], self.bands.size_px
         check_distance(optics.distance_um, self.source, self.target, optics.wavelength_um)
-        # Pixels between source and target in wrapped order; unused places repeat the largest.
+        # Pixel distances between source and target in wrapped order; unused entries repeat the largest.
         index = torch.arange(self.length)
         wrapped = torch.minimum(index, self.length - index).clamp(max=size - 1)
         away_um, below_um = wrapped.double() * pitch, torch.arange(size).double() * pitch
@@ -133,7 +136,8 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """The transfer function of free space; small elements need a longer period than their own."""
+        """Compute the transfer function of free space; small elements need a period longer than their side.
+        """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]
         rows, columns = spectrum_axes(*given)

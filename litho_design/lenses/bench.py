@@ -1,4 +1,4 @@
-"""The optics of a lens: from a printed height map to a point spread function and to images."""
+"""The optics of a lens: a printed height map gives a point spread function and images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """The common part of the benches of a plane and of rings: aperture, focal window, perfect lens."""
+    """What the benches of a plane and of rings share: aperture, focal window and perfect lens."""
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
@@ -37,35 +37,35 @@ class LensOptics(nn.Module):
 
     @property
     def numerical_aperture(self) -> float:
-        """Sine of the angle from the focus to the edge of the aperture, on an axis."""
+        """Return the sine of the angle from the focus to the edge of the aperture, on an axis."""
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
 
     def ratio(self, psf: Tensor) -> Tensor:
-        """Centre-to-background ratio of a PSF (window, window)."""
+        """Return the centre-to-background ratio of a PSF (window, window)."""
         centre_px = round(CENTRE_UM / self.layout.pitch_um)
         return centre_to_background(psf, centre_px, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """-log(centre-to-background ratio) of a PSF (window, window), and its parts."""
+        """Return -log(centre-to-background ratio) of a PSF (window, window), and its parts."""
         ratio = self.ratio(psf)
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
 
     def radius_um(self) -> Tensor:
-        """Distance from the axis of each height, float64, µm."""
+        """Return the distance from the axis of each height, float64, µm."""
         raise NotImplementedError
 
     def ideal_height_um(self) -> Tensor:
-        """Heights of a perfect lens, wrapped to one wave, µm."""
+        """Return the heights of a perfect lens, wrapped to one wave, µm."""
         focal_um = self.optics.distance_um
         path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt()
-        # The height that delays the wave by the path difference; wrapping does not change the wave.
+        # This height delays the wave by the path difference; wrapping does not change the wave.
         height = path * self.optics.wave_height_um / self.optics.wavelength_um
         return torch.remainder(height, self.optics.wave_height_um).float()
 
 
 class LensBench(LensOptics):
-    """A plane wave through a printed lens onto the focal window."""
+    """Propagate a plane wave through a printed lens onto the focal window."""
 
     aperture: Tensor
 
@@ -77,18 +77,18 @@ class LensBench(LensOptics):
         self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """PSF of a height map (size, size), µm: share of the incident power per window pixel."""
+        """Return the PSF of a height map (size, size), µm: share of the incident power per window pixel."""
         field = element_field(height_um, self.grid, self.optics, self.aperture)
         return intensity_share(self.propagator(field), self.window)
 
     def radius_um(self) -> Tensor:
-        """Distance from the axis of each pixel (size, size)."""
+        """Return the distance from the axis of each pixel (size, size)."""
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
         return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
 
 class RadialLensBench(LensOptics):
-    """The same PSF from the height along the central row, for ring layouts and circular apertures."""
+    """Compute the same PSF from the height along the central row, for ring layouts and circular apertures."""
 
     lower: Tensor
     share: Tensor
@@ -107,24 +107,25 @@ class RadialLensBench(LensOptics):
         self._incident = math.pi * (rings * layout.pitch_um) ** 2
 
     def forward(self, ring_height_um: Tensor) -> Tensor:
-        """PSF (window, window) of ring heights (rings,), µm."""
+        """Return the PSF (window, window) of ring heights (rings,), µm."""
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
-        # The wave, unlike the intensity, is smooth on the scale of a pixel, so it is interpolated.
+        # The wave is interpolated, not the intensity, because only the wave is smooth on the scale of a
+        # pixel.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
     def radius_um(self) -> Tensor:
-        """Distance from the axis of the middle of each ring (rings,)."""
+        """Return the distance from the axis of the middle of each ring (rings,)."""
         rings = torch.arange(self.propagator.rings, dtype=torch.float64, device=self.share.device)
         return (rings + 0.5) * self.layout.pitch_um
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
-    """Mean intensity of the central box over the mean of the rest of an element-sized image plane.
+    """Return the mean intensity of the central box over the mean of the rest of an element-sized image plane.
 
-    All light that misses the box counts as background, wherever it went: (1 - box) spread over the area of
-    the element. A ratio within the PSF window alone would reward light sent outside the window.
+    All light outside the box counts as background, wherever it goes: (1 - box) is spread over the area of the
+    element. A ratio computed only within the PSF window would reward light sent outside the window.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()
@@ -133,7 +134,7 @@ def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor
 
 
 def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
-    """PSF on sensor pixels, cropped to an odd number of pixels around the axis."""
+    """Return the PSF on sensor pixels, cropped to an odd number of pixels around the axis."""
     pixels = psf.shape[-1] // pixel_px
     pixels -= 1 - pixels % 2
     first = (psf.shape[-1] - pixels * pixel_px) // 2
@@ -142,9 +143,9 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 
 
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
-    """Sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
+    """Return sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
 
-    Photon noise, too, is Gaussian, with the variance of Poisson noise; the gradient treats its size as
+    Photon noise is also Gaussian, with the variance of Poisson noise; the gradient treats its size as
     constant.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))

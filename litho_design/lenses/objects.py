@@ -1,4 +1,4 @@
-"""Objects that a lens images: drawings, or pictures of your own."""
+"""The objects that a lens images: drawings, or your own pictures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from litho_design.lenses.settings import LensSettings
 _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
-# Name among the inputs of a lens: (pictures, size, size), the design's pictures first.
+# Name of this array among the inputs of a lens: (pictures, size, size), the design's pictures first.
 PICTURES = "object_pictures"
 
 
 def object_stack(
     objects: Sequence[ImagedObject], size_px: int, pictures: Iterable[np.ndarray] = ()
 ) -> Tensor:
-    """Objects (n, size, size) in [0, 1] with a dark border of one eighth.
+    """Return objects (n, size, size) in [0, 1] with a dark border of one eighth.
 
     Args:
         objects: names of drawings, and records of pictures.
@@ -51,11 +51,11 @@ def object_stack(
 def with_objects(
     settings: LensSettings, objects: Sequence[str | Path], held_out: Sequence[str | Path]
 ) -> tuple[LensSettings, dict[str, np.ndarray]]:
-    """``settings`` of a computational lens with your own pictures as objects.
+    """Return the ``settings`` of a computational lens, with your own pictures as objects.
 
-    A path is a picture, or a folder whose files, except hidden ones, are all pictures.
-    Without ``held_out``, the last quarter of the pictures in the order of their names, at least two, are held
-    out of the design and only scored. Without ``objects``, the design uses the drawings.
+    A path is a picture, or a folder whose files, except hidden ones, are all pictures. Without ``held_out``,
+    the last quarter of the pictures in the order of their names, at least two, are held out of the design and
+    only scored. Without ``objects``, the design uses the drawings.
 
     Returns:
         The settings, with name, SHA-256 and conversion of each picture, and the pixels as inputs of the task;
@@ -100,7 +100,7 @@ def with_objects(
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
-    """One sentence that names the objects if some are pictures; otherwise empty."""
+    """Return one sentence that names the objects if some are pictures, otherwise an empty list."""
     if all(isinstance(item, str) for item in (*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))
@@ -108,7 +108,7 @@ def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObje
 
 
 def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
-    """One picture as an object of ``size_px`` sensor pixels, its dark border included.
+    """Read one picture as an object of ``size_px`` sensor pixels, including its dark border.
 
     Returns:
         float32 (size, size) in [0, 1], and its record.

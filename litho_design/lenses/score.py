@@ -1,4 +1,4 @@
-"""Scores of a lens: of its PSF against that of a perfect lens, and of its images."""
+"""Score a lens: its PSF against that of a perfect lens, and its images."""
 
 from __future__ import annotations
 
@@ -79,28 +79,28 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 
 
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
-    """Diameter of the circle whose area lies above half the maximum, µm.
+    """Return the diameter of the circle whose area lies above half the maximum, µm.
 
-    The PSF is interpolated fourfold (zero-padded spectrum) so that pixels do not limit it.
+    The PSF is interpolated fourfold (zero-padded spectrum), so that its pixels do not limit the result.
     """
     fine = 4
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
     pad = (fine - 1) * psf.shape[-1] // 2
     image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
-    # An odd side cannot be padded to exactly four times its length.
+    # A spectrum with an odd side cannot be padded to exactly four times its length.
     sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
     area = float((image > image.max() / 2).sum()) * sample_um**2
     return 2 * math.sqrt(area / math.pi)
 
 
 def mtf(psf: Tensor) -> Tensor:
-    """|FFT(psf)| / DC, (n, n), zero frequency first."""
+    """Return |FFT(psf)| / DC, (n, n), zero frequency first."""
     transfer = torch.fft.fft2(psf).abs()
     return transfer / transfer[0, 0]
 
 
 def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
-    """MTF at one frequency, cycles/µm: mean of both axes, linear between samples."""
+    """Return the MTF at one frequency, cycles/µm: mean of both axes, linear between samples."""
     curve = mtf(psf)
     position = frequency_per_um * psf.shape[-1] * pitch_um
     index = int(position)
@@ -113,7 +113,8 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 def imaging_score(
     psf: Tensor, design_psf: Tensor, objects: Tensor, settings: ImagingSettings
 ) -> dict[str, float]:
-    """Image objects (n, size, size) through ``psf`` and reconstruct with both PSFs: see ``ImagingScore``.
+    """Image objects (n, size, size) through ``psf`` and reconstruct them with both PSFs: see
+    ``ImagingScore``.
 
     Args:
         psf, design_psf: (window, window), share of the incident power per window pixel.
@@ -132,13 +133,13 @@ def imaging_score(
 
 
 def black_images(objects: Tensor) -> dict[str, float]:
-    """The figures of images without light."""
+    """Return the figures of black images."""
     black = dict.fromkeys(("direct", "design", "calibrated"), torch.zeros_like(objects))
     return _of_images(_means(_similarities([black], objects)))
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Each figure of the images of all objects, by draw."""
+    """Return each figure of the images of all objects, by draw."""
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):
         for image, wanted in zip(images, objects, strict=True):

@@ -1,4 +1,4 @@
-"""All settings of a lens, by preset, including the choices that the paper leaves open."""
+"""The settings of a lens and their presets, including the choices that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ LensTaskName = Literal["direct", "computational"]
 class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
-    ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"``
-    searches with a strip through the centre and the ring propagator instead of the whole plane; it
-    needs a circular aperture and a ring layout, and scores always use the plane.
+    ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"`` searches with
+    a strip through the centre and the ring propagator instead of the whole plane. It needs a circular
+    aperture and a ring layout; scores always use the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})
@@ -44,12 +44,12 @@ class LensView(Record):
 
 
 class ImagingSettings(Record):
-    """Computational imaging: sensor, noise, reconstruction and the objects of design and test.
+    """Settings of computational imaging: sensor, noise, reconstruction, and the objects of design and test.
 
-    An object is the name of a drawing or the record of a picture (see ``with_objects``).
-    ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses
-    all light; the paper does not state its own. The image of an object is ``object_px * pixel_px`` pixels
-    of the layout wide, and light that the PSF window leaves out does not reach it.
+    An object is the name of a drawing or the record of a picture (see ``with_objects``). ``read_noise`` is
+    the standard deviation relative to a white object behind a lens that focuses all light; the paper does not
+    state its own. The image of an object is ``object_px * pixel_px`` pixels of the layout wide, and light
+    outside the PSF window does not reach it.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
@@ -85,7 +85,8 @@ class ImagingSettings(Record):
         return self
 
 
-# A display of 36 mm at 140 mm is 102.9 µm wide at 400 µm. Objects have a dark border of 1/8 on each side.
+# A display 36 mm wide at a distance of 140 mm has an image 102.9 µm wide at 400 µm. Objects have a dark
+# border of 1/8 on each side.
 PAPER_IMAGING = ImagingSettings(pixel_px=10, object_px=137)
 
 
@@ -100,7 +101,7 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # A draw computes a whole plane, which costs as much as ten steps of the search along a radius.
+    # Each draw computes a whole plane, which costs as much as ten steps of the search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
@@ -109,16 +110,17 @@ class LensSettings(DesignSettings):
 def lens_settings(
     task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> LensSettings:
-    """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings.
+    """Return a preset of the lens with ``changes`` by path; all have rings, a width of 120 µm and a focal
+    length of 400 µm.
 
-    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square
-    aperture; the rings are from the published code, as the text does not mention them. Its display, 36 mm
-    wide at 140 mm, is 102.9 µm wide on the sensor: 103 pixels of 1 µm, and as wide a PSF window. The pixel is
-    ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings as wide
-    as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25, smooth L1,
-    read and photon noise, their wavelength and index step, objects as wide as the lens. For what is not
-    reproduced of the published code, see docs/from_the_authors_code.md. ``default``: a circular aperture, the
-    Fresnel phase as start, and the ring path in the search.
+    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square aperture. The
+    rings come from the published code, as the text does not mention them. The paper's display, 36 mm wide at
+    140 mm, is imaged 102.9 µm wide on the sensor: 103 pixels of 1 µm. The PSF window is as wide. We chose the
+    pixel of 1 µm, which samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: the published
+    code has 12 levels, rings as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with
+    half the rate every 25, and smooth L1. It has read and photon noise, its own wavelength and index step,
+    and objects as wide as the lens. docs/from_the_authors_code.md lists what is not reproduced of that code.
+    ``default``: a circular aperture, the Fresnel phase as start, and the ring path in the search.
 
     Args:
         task: focus light, or image and deconvolve; a ``task`` in the changes replaces it.

@@ -1,4 +1,4 @@
-"""Lenses as tasks: from levels on the pixels to a loss, a score and the saved arrays."""
+"""Lenses as tasks: they turn levels on the pixels into a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ from litho_design.tasks.task import Task, register_task
 
 # Figures that make sense even if nothing focuses.
 _OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
-# The same noise in every iteration, so that the search compares layouts, not noise; scores draw their own.
+# The noise is the same in every iteration, so that the search compares layouts, not noise; scores draw other
+# noise.
 _DESIGN_NOISE_SEED = 0
 _PLANE_NOTE = (
     "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
@@ -46,7 +47,7 @@ _PLANE_NOTE = (
 
 
 def lens_task(settings: LensSettings, printer: Printer, **given: Any) -> LensTask:
-    """The task that ``settings.task`` names, with the arguments and errors of ``LensTask``."""
+    """Make the task that ``settings.task`` names, with the arguments and errors of ``LensTask``."""
     kind = DirectLensTask if settings.task == "direct" else ComputationalLensTask
     return kind(settings, printer, **given)
 
@@ -102,11 +103,13 @@ class LensTask(Task):
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
 
     def make_bench(self, optics: Optics) -> LensBench:
-        """The bench from the element to the focal window."""
+        """Return the bench from the element to the focal window."""
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Along a radius if layout and printers allow it, otherwise on the whole plane."""
+        """Return a bench along a radius if layout and printers allow one, otherwise a bench of the whole
+        plane.
+        """
         if not self.radial:
             return self.make_bench(optics)
         if optics.element == "thick":
@@ -115,42 +118,44 @@ class LensTask(Task):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_print(self, level: Tensor, printer: Printer) -> Tensor:
-        """Height of the rings (rings,) or of the plane (size, size), µm."""
+        """Return the height of the rings (rings,) or of the plane (size, size), µm."""
         return self.printed_rings(level, printer) if self.radial else self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
-        """Area of the rings."""
+        """Return the area of the rings."""
         bench = self.scenes[0][1]
         if not isinstance(bench, RadialLensBench):
             return None
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels whose print is nearest to a perfect lens; on the CPU, so that sums over rings repeat."""
+        """Return the levels whose print is nearest to a perfect lens, computed on the CPU so that sums over
+        rings are reproducible.
+        """
         phase = fresnel_lens_phase(self.cells.cpu(), self.settings.layout.pitch_um, self.settings.optics)
         self.cells.to(self.printer.device)
         return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
-        """Figures of the PSF of a print."""
+        """Return the figures of the PSF of a print."""
         return lens_score(self.bench, height_um)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores of a perfect lens and of a flat plate on the same grid."""
+        """Return the scores of a perfect lens and of a flat plate on the same grid."""
         ideal = self.bench.ideal_height_um()
         flat = lens_score(self.bench, torch.zeros_like(ideal)).model_dump(include=_OF_POWER)
         return {"perfect lens": self.score(ideal).model_dump(), "no lens": flat}
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Strehl ratio and centre-to-background ratio."""
+        """Return the Strehl ratio and centre-to-background ratio."""
         return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self.bench.ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """The root of the PSF over its peak."""
+        """Return the root of the PSF over its peak."""
         return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
-        """Height (rings,), µm, inside the aperture, from a print of a strip along a radius.
+        """Return the height (rings,), µm, inside the aperture, from the print of a strip along a radius.
 
         The strip continues the rings beyond the aperture, as the layout's corners do.
         """
@@ -172,7 +177,7 @@ class DirectLensTask(LensTask):
     score_type = LensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """-log(centre-to-background ratio)."""
+        """Return -log(centre-to-background ratio)."""
         return self.bench.focusing_loss(seen)
 
 
@@ -185,7 +190,7 @@ class ComputationalLensTask(LensTask):
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """The error of the objects after Richardson-Lucy."""
+        """Return the error of the objects after Richardson-Lucy deconvolution."""
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
         image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
@@ -197,19 +202,21 @@ class ComputationalLensTask(LensTask):
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
-        """Also those of the images of test objects; ``expected_um`` is by default the print."""
+        """Return the PSF's figures and those of the images of test objects; ``expected_um`` is by default the
+        print.
+        """
         with torch.no_grad():
             psf, design_psf = (self.bench(height_um if one is None else one) for one in (None, expected_um))
         tested = imaging_score(psf, design_psf, self.tested, self.settings.imaging)
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Also the errors of black images."""
+        """Add the errors of black images to the baselines."""
         return super().baselines() | {"black image": black_images(self.tested)}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
-    """A note if the PSF window is narrower than the focusing circle."""
+    """Return a note if the PSF window is narrower than the focusing circle."""
     # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
     window_um, enough_px = bench.window.size_um[0], math.ceil(2 * radius_um / bench.layout.pitch_um)
@@ -223,9 +230,10 @@ def _narrow_window(bench: LensBench) -> list[str]:
 
 @lru_cache(maxsize=8)
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
-    """Ring of each pixel of a strip: two central rows, rings 0 to the aperture, a halo all round.
+    """Return the ring of each pixel of a strip: two central rows, rings 0 to the aperture, and a halo on all
+    sides.
 
-    Beyond the last of the ``rings`` the strip continues with it.
+    Beyond the last of the ``rings``, the strip repeats that ring.
     """
     along = torch.arange(-halo_px, layout.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5

@@ -1,4 +1,4 @@
-"""Scalar diffraction: pure, differentiable, tested against closed forms."""
+"""Scalar diffraction in pure, differentiable functions, tested against closed forms."""
 
 from __future__ import annotations
 
@@ -19,5 +19,6 @@ if TYPE_CHECKING:
     from litho_design.optics.thin_element import element_field as element_field
     from litho_design.optics.thin_element import intensity_share as intensity_share
 else:
-    # Loaded when used: the command line reads the settings in `Optics` without torch.
+    # Names are loaded when they are used, because the command line reads the settings in `Optics` without
+    # torch.
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

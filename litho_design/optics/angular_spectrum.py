@@ -1,4 +1,4 @@
-"""Band-limited angular spectrum propagation, for distances too short for the sampled kernel."""
+"""Propagate with the band-limited angular spectrum, at distances too short for the sampled kernel."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _LONGEST_PERIOD = 4096
 class ASMPropagator(KernelPropagator):
     """Carry a complex field to a parallel plane with the transfer function of free space.
 
-    H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)); the root is complex, so evanescent waves decay
-    instead of becoming NaN. The period of the sampled H is long enough, up to 4096 pixels, that its steepest
-    rays do not wrap around; frequencies whose rays are steeper than the period allows are removed (after
-    Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). The kernel is kept only at the separations
-    between the two grids, so padding costs nothing after construction. A negative distance runs the
-    propagating waves backwards and drops the evanescent ones.
+    H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so evanescent waves decay instead of
+    becoming NaN. The sampled H has a period, up to 4096 pixels, that is long enough to keep its steepest rays
+    from wrapping around. Frequencies whose rays are steeper than the period allows are removed (after
+    Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). Only the samples of the kernel at separations
+    between the two grids are stored, so padding costs nothing after construction. A negative distance runs
+    the propagating waves backwards and drops the evanescent ones.
 
-    Pixels above half a wavelength limit the steepness of rays, and the result is exact for waves within their
-    band. With smaller pixels, rays up to grazing ones exist: 1 % of the wave of a rough element is missing or
-    wrapped, and ``RSPropagator`` is the better choice.
+    With pixels above half a wavelength the steepness of rays is limited, and the result is exact for waves
+    within their band. With smaller pixels, rays up to grazing incidence exist: 1 % of the wave of a rough
+    element is missing or wrapped, and ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of equal pitch; shape and origin are free.
@@ -64,7 +64,9 @@ class ASMPropagator(KernelPropagator):
 
 @dataclass(frozen=True)
 class SpectrumAxis:
-    """One axis: frequencies (cycles/µm), mask of the kept ones, samples of the kernel, shift of the grids."""
+    """One axis: frequencies (cycles/µm), a mask of those kept, samples of the kernel, and the shift between
+    the grids.
+    """
 
     frequency: Tensor
     inside: Tensor
@@ -72,20 +74,22 @@ class SpectrumAxis:
     start_um: float
 
     def part(self, which: slice) -> SpectrumAxis:
-        """The axis restricted to some of its frequencies."""
+        """Restrict the axis to some of its frequencies."""
         return replace(self, frequency=self.frequency[which], inside=self.inside[which])
 
 
 def spectrum_axes(
     source: PixelGrid, target: PixelGrid, distance_um: float, wavelength_um: float
 ) -> tuple[SpectrumAxis, SpectrumAxis]:
-    """Both axes, y first, of the spectrum between two grids."""
+    """Return both axes of the spectrum between two grids, y first."""
     y, x = (_axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1))
     return y, x
 
 
 def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
-    """Transfer function of free space, complex128 (y, x); 0 at frequencies too steep for the period."""
+    """Return the transfer function of free space, complex128 (y, x); it is 0 at frequencies too steep for the
+    period.
+    """
     fy, fx = y.frequency[:, None], x.frequency[None, :]
     band = y.inside[:, None] & x.inside[None, :]
     axial = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double()).sqrt()
@@ -109,7 +113,7 @@ def _axis_band(
     middle = start + (there - here) * pitch / 2
     cosine = (1 - (wavelength_um * frequency) ** 2).clamp(min=0).sqrt()
     ray_shift = distance_um * wavelength_um * frequency
-    # A ray wraps around if it travels a period beyond the far edge of the target.
+    # A ray wraps around if it travels one period beyond the far edge of the target.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
     # At zero distance nothing changes, not even evanescent waves.

@@ -1,4 +1,4 @@
-"""A linear convolution by FFT that computes only the samples that are kept, also in its gradient."""
+"""Convolve by FFT and compute only the samples that are kept, also in the gradient."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_design.optics.sampling import fast_length
 class KernelPropagator(nn.Module):
     """Carry a field from one plane to another by convolution with a kernel.
 
-    The kernel lies on a grid that is finer than those of source and target by integer factors.
+    The kernel's grid is finer than those of source and target by integer factors.
 
     Args:
         kernel: complex128 (ky, kx) at the separations of ``wrapped_order``.
@@ -34,7 +34,7 @@ class KernelPropagator(nn.Module):
     ):
         super().__init__()
         self.source, self.target, self._finer = source, target, finer
-        # Not persistent: it follows from the arguments, so checkpoints need not contain it.
+        # The buffer is not persistent: it follows from the arguments, so checkpoints need not contain it.
         self.register_buffer("transfer", torch.fft.fft2(kernel).to(dtype), persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -44,22 +44,27 @@ class KernelPropagator(nn.Module):
         return found[..., :: there[0], :: there[1]]
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """P^H of ``forward``, complex (..., my, mx) to (..., ny, nx), which sends a field back."""
+        """Apply P^H, the adjoint of ``forward``, which sends a field back: complex (..., my, mx) to (..., ny,
+        nx).
+        """
         here, there = self._finer
         found = convolve(_spread(field, there), self.transfer.conj(), fine_shape(self.source.shape, here))
         return found[..., :: here[0], :: here[1]]
 
 
 def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
-    """Shape of a grid on pixels ``finer`` times as fine, from its first centre to its last."""
+    """Return the shape of a grid with pixels ``finer`` times as fine, from the first to the last pixel
+    centre.
+    """
     rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
     return rows, columns
 
 
 def wrapped_order(here: int, there: int) -> Tensor:
-    """Separations, pixels, between a source of ``here`` pixels and a target of ``there``, negative ones last.
+    """Return the separations, in pixels, between a source of ``here`` and a target of ``there`` pixels,
+    negative ones last.
 
-    Unused places repeat a used separation.
+    Unused entries repeat a used separation.
     """
     length = fast_length(here + there - 1)
     index = torch.arange(length)
@@ -81,9 +86,10 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
 
 class _Convolution(torch.autograd.Function):
-    """The adjoint is the same operation with the conjugate transfer and the two shapes exchanged.
+    """The adjoint is the same operation with the conjugate transfer function and the two shapes exchanged.
 
-    It is written out because autograd would keep padded copies and transform the rows that are cropped.
+    The gradient is written out because autograd would keep padded copies and transform the rows that are
+    cropped.
     """
 
     @staticmethod
@@ -102,7 +108,7 @@ class _Convolution(torch.autograd.Function):
 
 
 def _spread(field: Tensor, finer: tuple[int, int]) -> Tensor:
-    """A field on finer pixels, dark between its own pixels."""
+    """Place a field on finer pixels, with zeros between its own pixels."""
     if finer == (1, 1):
         return field
     fine = field.new_zeros(*field.shape[:-2], *fine_shape(field.shape[-2:], finer))

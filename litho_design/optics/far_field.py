@@ -1,4 +1,6 @@
-"""The far field: the focal plane of an ideal lens behind the element, where positions are angles."""
+"""Propagate to the far field: the focal plane of an ideal lens behind the element, where positions are
+angles.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,9 @@ from litho_data.foundation.grid import PixelGrid
 class FarFieldPropagator(nn.Module):
     """Carry a field to the focal plane of an ideal lens.
 
-    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx: position p stands for the sine p / f. The sum is
-    exact for any two grids, as one matrix per axis, and pixels are squares (Goodman, Fourier Optics, ch. 5).
+    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx, where position p corresponds to the sine p / f.
+    The sum is exact for any two grids and uses one matrix per axis; pixels are squares (Goodman, Fourier
+    Optics, ch. 5).
 
     Args:
         source, target: grids of the two planes, µm; any shapes and pitches.
@@ -59,5 +62,5 @@ class FarFieldPropagator(nn.Module):
         return -1j * (self.along_y @ field @ self.along_x.T)
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """P^H of ``forward``: complex (..., my, mx) to (..., ny, nx)."""
+        """Apply P^H, the adjoint of ``forward``: complex (..., my, mx) to (..., ny, nx)."""
         return 1j * (self.along_y.mH @ field @ self.along_x.conj())

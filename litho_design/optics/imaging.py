@@ -1,4 +1,4 @@
-"""Incoherent imaging: an object blurred by an intensity point spread function, and its deconvolution."""
+"""Incoherent imaging: blur an object with an intensity point spread function, and deconvolve the image."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Steps per block that the gradient computes again. If all steps fit into the memory below, they are kept
-# instead: about twenty values per pixel and step.
+# Number of steps in a block that the gradient computes again. If all steps fit into the memory below, they
+# are kept instead: about twenty values per pixel and step.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """x -> psf * x on the object's frame, dark outside it; linear, without wrap-around.
+    """Apply x -> psf * x on the object's frame, dark outside it; the operation is linear and does not wrap
+    around.
 
     The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
@@ -29,20 +30,20 @@ class Blur:
         rows, columns = psf.shape
         assert rows % 2 == columns % 2 == 1, "a PSF of odd sides has a middle sample"
         self._frame = frame
-        # Pixel i gets from j the PSF at i - j and, wrapped, at i - j ± length. If the length is that of frame
-        # plus half a PSF, the wrapped samples lie beyond the PSF. The array must also hold the PSF. The
-        # length is even, because a real transform of odd length takes nearly twice as long.
+        # Pixel i receives from pixel j the PSF at i - j and, wrapped around, at i - j ± length. If the length
+        # is that of the frame plus half a PSF, the wrapped samples lie beyond the PSF. The array must also
+        # hold the PSF. The length is even, because a real transform of odd length takes nearly twice as long.
         lengths = (max(n + k // 2, k) for n, k in zip(frame, (rows, columns), strict=True))
         self._size = [2 * fast_length(-(-length // 2)) for length in lengths]
         middle_first = torch.nn.functional.pad(psf, (0, self._size[1] - columns, 0, self._size[0] - rows))
         self._transfer = torch.fft.rfft2(middle_first.roll((-(rows // 2), -(columns // 2)), (0, 1)))
 
     def forward(self, image: Tensor) -> Tensor:
-        """psf * image, (..., ny, nx)."""
+        """Return psf * image, (..., ny, nx)."""
         return self._filter(image, self._transfer)
 
     def transpose(self, image: Tensor) -> Tensor:
-        """The transposed operator (correlation with the PSF), (..., ny, nx)."""
+        """Apply the transposed operator (correlation with the PSF), (..., ny, nx)."""
         return self._filter(image, self._transfer.conj())
 
     def _filter(self, image: Tensor, transfer: Tensor) -> Tensor:

@@ -16,7 +16,9 @@ _SELLMEIER = {"ip-dip-2019": ((1.2899, 1.1283e-2), (6.0569e-2, 7.7762e-2), (1.18
 
 
 def refractive_index(resin: Resin, wavelength_um: float) -> float:
-    """Refractive index of a resin; 1 at all wavelengths for ``constant``, where only differences matter."""
+    """Return the refractive index of a resin; 1 at all wavelengths for ``constant``, where only differences
+    matter.
+    """
     if resin == "constant":
         return 1.0
     square = wavelength_um**2

@@ -1,4 +1,4 @@
-"""The propagator of a scene: one that is valid at its distance, or the requested one."""
+"""Choose the propagator of a scene: the requested one, or one that is valid at its distance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def make_propagator(
     """Carry waves from ``source`` to ``target`` in ``optics``.
 
     ``auto`` takes the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter distances it
-    takes the angular spectrum, whose period is long enough there without further padding. ``far-field`` takes
+    takes the angular spectrum, whose period is then long enough without further padding. ``far-field`` takes
     the distance as the focal length of an ideal lens.
 
     Raises:
@@ -34,6 +34,8 @@ def make_propagator(
 
 
 def takes_spectrum(source: PixelGrid, target: PixelGrid, optics: Optics) -> bool:
-    """Whether to use the angular spectrum, by request or because the sum would be aliased."""
+    """Return whether to use the angular spectrum, because it is requested or because the sum would be
+    aliased.
+    """
     near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
     return optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)

@@ -1,4 +1,4 @@
-"""Rayleigh-Sommerfeld propagation of ring-symmetric fields: a matrix instead of a 2-D transform."""
+"""Propagate ring-symmetric fields by Rayleigh-Sommerfeld, with a matrix instead of a 2-D transform."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _CHUNK_ENTRIES = 1 << 23
 class RadialPropagator(nn.Module):
     """Carry a field of concentric rings to points at given radii of a parallel plane.
 
-    U(p) = sum over rings of u times the integral of h over the ring, with h as in ``RSPropagator``.
-    Each ring is integrated with two Gauss-Legendre nodes across and the midpoint rule around; the error of
-    the latter on a periodic integrand falls exponentially once the phase is resolved.
+    U(p) = sum over rings of u times the integral of h over the ring, with h as in ``RSPropagator``. Each ring
+    is integrated with two Gauss-Legendre nodes across it and the midpoint rule around it. The midpoint rule's
+    error on a periodic integrand falls exponentially once the phase is resolved.
 
     Args:
         rings: number of rings; ring i covers radii [i, i + 1) * ring_width_um.
@@ -54,7 +54,7 @@ class RadialPropagator(nn.Module):
 
     @property
     def ring_area_um2(self) -> Tensor:
-        """Area of each ring, float64 (rings,), µm^2; sums of |u|^2 over it are powers."""
+        """Return the area of each ring, float64 (rings,), µm^2; |u|^2 summed with these areas is a power."""
         return math.pi * self.ring_width_um**2 * (2 * torch.arange(self.rings, dtype=torch.float64) + 1)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ def _ring_matrix(
 def _half_circle(
     source_radius_um: float, target_radius_um: Tensor, distance_um: float, wavelength_um: float
 ) -> tuple[Tensor, float]:
-    """Midpoints on (0, pi), dense enough for the fastest phase around any ring."""
+    """Return midpoints on (0, pi), dense enough for the fastest phase change around any ring."""
     target = float(target_radius_um.max())
     far = math.hypot(source_radius_um + target, distance_um)
     near = math.hypot(source_radius_um - target, distance_um)

@@ -1,4 +1,4 @@
-"""Rayleigh-Sommerfeld propagation: the exact discrete convolution between two planes."""
+"""Propagate by Rayleigh-Sommerfeld: an exact discrete convolution between two planes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _LARGEST_RATIO = 16
 
 
 class RSPropagator(KernelPropagator):
-    """Carry a complex field from one plane to a parallel one (first Rayleigh-Sommerfeld integral).
+    """Carry a complex field from one plane to a parallel plane (first Rayleigh-Sommerfeld integral).
 
-    U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with
-    h = z / (2 pi r^2) (1/r - j k) exp(j k r), r^2 = x^2 + y^2 + z^2, k = 2 pi / wavelength
-    (time convention in which exp(+j k r) runs outwards; Goodman, Fourier Optics, ch. 3).
-    The sum is exact: the kernel is centred and spans all separations. Unequal pitches must have a ratio of
-    small integers; the kernel then lies on the coarsest pixels that divide both.
+    U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with h = z / (2 pi r^2) (1/r - j k) exp(j k r),
+    r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In this time convention exp(+j k r) runs outwards
+    (Goodman, Fourier Optics, ch. 3). The sum is exact: the kernel is centred and spans all separations.
+    Unequal pitches must have a ratio of small integers; the kernel is then sampled on the coarsest pixels
+    that divide both.
 
     Args:
         source, target: grids of the two planes, origin and pitch in µm.
@@ -66,7 +66,9 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Numbers of equal parts that divide the first and the second pitch; None if they are too many."""
+    """Return into how many equal parts the first and the second pitch are divided; None if too many are
+    needed.
+    """
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:
         return None
@@ -74,7 +76,8 @@ def _ratio(pitches: float) -> tuple[int, int] | None:
 
 
 def rs_kernel(y_um: Tensor, x_um: Tensor, distance_um: float, wavelength_um: float) -> Tensor:
-    """h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128 on broadcast separations."""
+    """Return h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128, at broadcast separations.
+    """
     wavenumber = 2 * math.pi / wavelength_um
     squared = y_um.double() ** 2 + x_um.double() ** 2 + distance_um**2
     radius = squared.sqrt()

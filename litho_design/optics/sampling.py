@@ -1,4 +1,4 @@
-"""Centred grids, and the distances at which a sampled propagation kernel is valid."""
+"""Make centred grids, and find the distances at which a sampled propagation kernel is valid."""
 
 from __future__ import annotations
 
@@ -8,24 +8,26 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
-# Replicas of the spectrum sit at 1/pitch; two decay lengths of the evanescent wave there leave 4e-6.
+# Replicas of the spectrum lie at 1/pitch; two decay lengths of the evanescent wave at this frequency leave
+# 4e-6.
 _DECAY_LENGTHS = 2.0
 
 
 def centred_grid(
     shape: tuple[int, int], pitch_um: float, centre_um: tuple[float, float] = (0.0, 0.0)
 ) -> PixelGrid:
-    """A grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes alike."""
+    """Make a grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes alike.
+    """
     grid = PixelGrid.square(shape, pitch_um)
     height, width = grid.size_um
     return replace(grid, origin_um=(centre_um[0] - height / 2, centre_um[1] - width / 2))
 
 
 def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float) -> float:
-    """Smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
+    """Return the smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
 
-    Far from the axis the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below
-    the Nyquist frequency of the source; close to it the evanescent replicas must have decayed.
+    Far from the axis the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below the
+    Nyquist frequency of the source. Close to the axis the evanescent replicas must have decayed.
     """
     limit = 0.0
     for axis in range(2):
@@ -55,7 +57,7 @@ def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wav
 
 
 def fast_length(length: int) -> int:
-    """The next size for which the FFT is fast (factors 2, 3 and 5 only)."""
+    """Return the next size for which the FFT is fast (factors 2, 3 and 5 only)."""
     from scipy.fft import next_fast_len  # imported late to save the command line a tenth of a second
 
     found: int = next_fast_len(length, real=True)
@@ -63,12 +65,12 @@ def fast_length(length: int) -> int:
 
 
 def first_centre_um(grid: PixelGrid, axis: int) -> float:
-    """Coordinate of the first pixel centre along ``axis`` (0 = y, 1 = x), µm."""
+    """Return the coordinate of the first pixel centre along ``axis`` (0 = y, 1 = x), µm."""
     return grid.origin_um[axis] + grid.pitch_um[axis] / 2
 
 
 def largest_separation_um(source: PixelGrid, target: PixelGrid, axis: int) -> float:
-    """Largest distance along ``axis`` between a pixel of the source and one of the target, µm."""
+    """Return the largest distance along ``axis`` between a pixel of the source and one of the target, µm."""
     start = first_centre_um(target, axis) - first_centre_um(source, axis)
     source_span = (source.shape[axis] - 1) * source.pitch_um[axis]
     target_span = (target.shape[axis] - 1) * target.pitch_um[axis]

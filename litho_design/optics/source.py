@@ -1,4 +1,4 @@
-"""Light other than one plane wave of one colour: an incoherent source of some width and bandwidth."""
+"""Light from an incoherent source of some width and bandwidth, instead of one plane wave of one colour."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_design.optics.thin_element import Optics
 
-# Points of a source per (wavelength / side)^2 of its area in sines: closer than an element resolves.
+# Points of a source per (wavelength / side)^2 of its area in sines: they lie closer together than an element
+# resolves.
 _POINTS_PER_AREA = 3
 _FEWEST = 8
 _MOST = 128
@@ -17,11 +18,13 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
-    """Plane waves of one colour whose images add up to that of the source, each with its share of the light.
+    """Return plane waves of one colour whose images add up to the image of the source, each with its share of
+    the light.
 
-    Colours sample a Gaussian spectrum by Gauss-Hermite quadrature; directions are spread evenly on a disc of
-    sines around that of ``optics``. The images of neighbours are closer than lambda z / D, the finest detail
-    of an element of side D. A point source of one colour is one part, unchanged.
+    Colours sample a Gaussian spectrum by Gauss-Hermite quadrature. Directions are spread evenly on a disc of
+    sines around the direction of ``optics``. The images of neighbouring waves are closer than lambda z / D,
+    the finest detail of an element of side D. A point source of one colour is returned unchanged, as one
+    part.
 
     Args:
         size_um: side of the element.
@@ -40,7 +43,7 @@ def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]
 def _colours(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
     if not optics.bandwidth_um:
         return [(1.0, optics)]
-    # Detail at the edge of the image moves by D / 2 times the relative change of the wavelength.
+    # A detail at the edge of the image moves by D / 2 times the relative change of the wavelength.
     widths = optics.bandwidth_um * size_um**2 / (2 * optics.wavelength_um**2 * optics.distance_um)
     nodes, weights = np.polynomial.hermite_e.hermegauss(_checked(3 + 2 * math.ceil(2 * widths), "bandwidth"))
     return [
@@ -56,7 +59,7 @@ def _directions(optics: Optics, size_um: float) -> list[tuple[float, float]]:
     area = math.pi * (optics.source_sine * size_um / optics.wavelength_um) ** 2
     count = _checked(max(_FEWEST, math.ceil(_POINTS_PER_AREA * area)), "width")
     number = np.arange(count)
-    # Arranged like the seeds of a sunflower, so that each has the same area.
+    # The points are arranged like the seeds of a sunflower, so that each has the same area.
     disc = optics.source_sine * np.sqrt((number + 0.5) / count) * np.exp(1j * _GOLDEN_ANGLE * number)
     disc += complex(*middle) - disc.mean()
     return [(one.real, one.imag) for one in disc.tolist()]
@@ -73,7 +76,7 @@ def _checked(count: int, what: str) -> int:
 
 
 def require_one_wave(optics: Optics, what: str) -> None:
-    """Refuse a source of some width or bandwidth if only one plane wave is computed.
+    """Refuse a source of some width or bandwidth where only one plane wave is computed.
 
     Raises:
         InputError: such a source.

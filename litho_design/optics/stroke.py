@@ -1,4 +1,4 @@
-"""Stroke of a print: the share of light that its staircase of levels can send into a diffraction order."""
+"""The stroke of a print: how much light its staircase of levels can send into a diffraction order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels as one period of a blaze; None for figures that need a full wave."""
+    """Printed heights of the levels, seen as one period of a blaze; None for figures that need a full wave.
+    """
 
     printed_height_um: list[float]
     stroke_um: float
@@ -22,7 +23,8 @@ class Stroke(Record):
 
 
 def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
-    """Scalar efficiency of a blazed grating with ``steps`` equal steps whose stroke is ``gain`` waves.
+    """Return the scalar efficiency of a blazed grating with ``steps`` equal steps whose stroke is ``gain``
+    waves.
 
     eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2.
     """
@@ -37,7 +39,7 @@ def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
 def measure_stroke(
     printed_height_um: Sequence[float], wave_height_um: float, *, level_height_um: float
 ) -> Stroke:
-    """Efficiency of printed levels as one period of a blaze.
+    """Return the efficiency of the printed levels, seen as one period of a blaze.
 
     Args:
         printed_height_um: printed height of a wide uniform area of each level, µm.
@@ -45,13 +47,13 @@ def measure_stroke(
         level_height_um: nominal step, µm.
 
     Returns:
-        The stroke, its first and zero order as a blaze, and the number of levels (or the step height)
-        with which the print would reach one wave.
+        The stroke, its efficiency in the first and zero order as a blaze, and the number of levels (or the
+        step height) with which the print would reach one wave.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]
     gain = stroke_um / ((count - 1) * level_height_um) if count > 1 else 0.0
-    # A period of N equal steps spans N/(N-1) of the highest step.
+    # A period of N equal steps spans N/(N-1) of the height of its highest step.
     period_waves = stroke_um / wave_height_um * count / max(count - 1, 1)
     return Stroke(
         printed_height_um=list(printed_height_um),

@@ -1,4 +1,4 @@
-"""The wave propagation method: light through a relief of finite height, slice by slice."""
+"""The wave propagation method: send light through a relief of finite height, slice by slice."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import math
 import torch
 from torch import Tensor
 
-# Slices a twentieth of a wave high: halving them changes a blaze of 1.6 µm period by less than 0.002.
+# Slices are a twentieth of a wave high: halving them changes a blaze of 1.6 µm period by less than 0.002.
 _SLICES_PER_WAVELENGTH = 20
 
 
 def wave_through_relief(
     field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
 ) -> Tensor:
-    """The wave behind a relief from the wave at its foot, carried back to the foot as for a thin element.
+    """Return the wave behind a relief, from the wave at its foot; the result is carried back to the foot, as
+    for a thin element.
 
     In every slice the wave is propagated by the angular spectrum twice, in the resist and in air, and each
     pixel takes the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the
-    surface cuts mixes both by their shares, so that gradients flow. One reflection at normal incidence is
-    included: (n - 1)^2 / (n + 1)^2 is lost. The result is propagated back through air to the foot, the plane
-    of a thin element. The field is periodic beyond the borders.
+    surface cuts mixes both waves by their shares, so that gradients flow. One reflection at normal incidence
+    is included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air
+    to the foot, the plane of a thin element. The field is periodic beyond the borders.
 
     Args:
         field: complex (..., ny, nx) at the foot of the relief, inside the resist.
@@ -36,7 +37,7 @@ def wave_through_relief(
 
     def carried(n: float, distance_um: float) -> Tensor:
         axial = torch.complex((n / wavelength_um) ** 2 - squared, torch.zeros_like(squared)).sqrt()
-        # Evanescent waves decay on the way forward and are dropped on the way back.
+        # Evanescent waves decay on the way forward, and are dropped on the way back.
         kept = torch.ones_like(squared) if distance_um > 0 else (axial.imag == 0).double()
         return (torch.exp(2j * math.pi * distance_um * axial) * kept).to(field.dtype)
 

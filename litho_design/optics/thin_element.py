@@ -1,4 +1,4 @@
-"""From a height map to the wave behind it."""
+"""Compute the wave behind a height map."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
-# A shorter or longer wavelength is probably a number in metres or nanometres.
+# A shorter or longer wavelength was probably given in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
 # Border around the element: how far light spreads within the height of a relief.
 _BORDER_UM = 2.0
@@ -83,14 +83,14 @@ class Optics(Record):
     dispersion: Resin = setting("ip-dip", "Resin whose dispersion is used if the wavelength varies")
 
     def at_wavelength(self, wavelength_um: float) -> Optics:
-        """The same optics at another wavelength, with the index step that the resin has there."""
+        """Return the same optics at another wavelength, with the resin's index step at this wavelength."""
         there, here = (refractive_index(self.dispersion, one) for one in (wavelength_um, self.wavelength_um))
         step = self.index_step + there - here
         return self.model_copy(update={"wavelength_um": wavelength_um, "index_step": step})
 
     @property
     def wave_height_um(self) -> float:
-        """Height that delays the wave by one period, µm."""
+        """Return the height that delays the wave by one period, µm."""
         return self.wavelength_um / self.index_step
 
 
@@ -102,12 +102,12 @@ def element_field(
     *,
     pixels: int | None = None,
 ) -> Tensor:
-    """The wave just behind a phase element that is lit by a plane wave of unit power.
+    """Return the wave just behind a phase element that a plane wave of unit power illuminates.
 
-    u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
-    elsewhere, times a Gaussian beam and the wave of a near point if the optics have them, scaled so that sum
-    |u|^2 dy dx = 1. So the sum of intensities over any window, times its pixel area, is a share of the
-    incident power. For a thick element, ``wave_through_relief`` replaces the phase, in air.
+    u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
+    It is multiplied by a Gaussian beam and the wave of a near point if the optics have them, and scaled so
+    that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are therefore a share
+    of the incident power. For a thick element in air, ``wave_through_relief`` replaces the phase.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -144,12 +144,14 @@ def element_field(
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """The wave behind a thick element in air that is lit by ``field`` (..., ny, nx), dark around it."""
+    """Return the wave behind a thick element in air that ``field`` (..., ny, nx) illuminates; it is dark
+    around the element.
+    """
     import torch
 
     from litho_design.optics.thick_element import wave_through_relief
 
-    # Dark beyond the borders, so that light that leaves on one side does not enter on the other.
+    # The surroundings are dark, so that light that leaves on one side does not enter on the other.
     border = (math.ceil(_BORDER_UM / pitch_um),) * 4
     dark = torch.nn.functional.pad(field, border)
     relief = torch.nn.functional.pad(height_um - height_um.amin(), border)
@@ -158,5 +160,5 @@ def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Op
 
 
 def intensity_share(field: Tensor, grid: PixelGrid) -> Tensor:
-    """|U|^2 times the pixel area: the share of the incident power that falls on each pixel."""
+    """Return |U|^2 times the pixel area, which is the share of the incident power on each pixel."""
     return (field.real.square() + field.imag.square()) * math.prod(grid.pitch_um)

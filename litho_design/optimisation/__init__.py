@@ -1,1 +1,1 @@
-"""Free parameters, starts, search and polish; losses over a process window or several models."""
+"""Free parameters, starts, search, polish, and losses over a process window or several models."""

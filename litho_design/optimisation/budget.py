@@ -1,4 +1,4 @@
-"""Time and memory of a design, estimated before it starts."""
+"""Estimate the time and memory of a design before it starts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """The estimate in one line, for the iterations left after ``done``, and for scores and report."""
+        """State the estimate in one line: for the iterations left after ``done``, and for scores and report.
+        """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
         minutes = (searched + left / search.evaluate_every * self.seconds_per_evaluation + seconds_after) / 60
@@ -63,7 +64,7 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Highest memory so far: of the device for CUDA, otherwise of the process."""
+    """Return the highest memory use so far: of the device for CUDA, otherwise of the process."""
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

@@ -1,4 +1,4 @@
-"""The checkpoint that an interrupted search leaves in its folder and resumes from."""
+"""The checkpoint that an interrupted search leaves in its folder, and from which it resumes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_design.optimisation.ranks import Ranks
 
-# The error that torch raises for a damaged file depends on the position of the damage.
+# The exception that torch raises for a damaged file depends on the position of the damage.
 _DAMAGED = (
     RuntimeError,
     pickle.UnpicklingError,
@@ -31,20 +31,20 @@ _DAMAGED = (
 
 @dataclass
 class SearchState:
-    """The state of a search, from which it resumes together with its settings and stateful parts."""
+    """The state from which a search resumes, together with its settings and stateful parts."""
 
     iteration: int = 0
     best_loss: float = math.inf
     best_levels: Tensor | None = None
     history: list[dict[str, float]] = field(default_factory=list)
-    # Time of the search in interrupted runs.
+    # Time that the search took in earlier, interrupted runs.
     earlier_seconds: float = 0.0
 
 
 def save_checkpoint(
     path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Any], seconds: float
 ) -> None:
-    """Write the state of a search and of its parts; ``fingerprint`` says which task they belong to."""
+    """Write the state of a search and of its parts; ``fingerprint`` says to which task they belong."""
     found = vars(state) | {"earlier_seconds": seconds}
     states = {name: part.state_dict() for name, part in stateful.items()}
     content = states | {"fingerprint": fingerprint, "found": found}
@@ -77,12 +77,15 @@ def load_checkpoint(
 
 
 def checkpoint_path(folder: Path, part: str = "") -> Path:
-    """File in which a search in ``folder`` keeps its state; ``part`` is its part of a shared search."""
+    """Return the file in which a search in ``folder`` stores its state; ``part`` names its part of a shared
+    search.
+    """
     return folder / f"checkpoint{part}.pt"
 
 
 def finished_iterations(folder: Path, ranks: Ranks) -> int:
-    """Iterations of an interrupted run in ``folder`` that all its processes have finished; 0 without one.
+    """Return how many iterations of an interrupted run in ``folder`` all its processes have finished; 0
+    without a run.
 
     Raises:
         InputError: the processes differ in their iterations, or their number has changed.
@@ -106,7 +109,7 @@ def remove_checkpoint(folder: Path, part: str = "") -> None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """A checkpoint, loaded to the CPU first, so that a full GPU does not look like a damaged file."""
+    """Load a checkpoint to the CPU first, so that a full GPU does not look like a damaged file."""
     stored = path.read_bytes()
     try:
         content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")

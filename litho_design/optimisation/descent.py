@@ -1,4 +1,4 @@
-"""Plain gradient descent of a few free numbers, for baselines without a printer."""
+"""Plain gradient descent of a few free numbers, for baselines that need no printer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 T = TypeVar("T")
 
 
-# It needs gradients, even if the caller disabled them, as scores mostly do.
+# Descent needs gradients, even if the caller disabled them, as scores mostly do.
 @torch.enable_grad()
 def descended(
     free: Iterable[Tensor],
@@ -21,7 +21,7 @@ def descended(
     iterations: int,
     project: Callable[[], object] = lambda: None,
 ) -> tuple[T, float]:
-    """Minimise ``loss`` by Adam; returns the second result of the best step, and its loss.
+    """Minimise ``loss`` by Adam; return the second result of the best step, and its loss.
 
     Args:
         free: the numbers to change, in place.

@@ -1,4 +1,5 @@
-"""Free parameters and the layout that they describe: cells or rings, Gumbel-Softmax or rounded heights."""
+"""Free parameters and the layout that they describe: cells or rings, with Gumbel-Softmax or rounded heights.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +12,17 @@ from litho_design.optimisation.process_window import blurred
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
-# A learning rate of 1 moves by one of 13 levels, and by the same share of the height with more or fewer
-# levels.
+# A learning rate of 1 moves a height by one of 13 levels, and by the same share of the height with more or
+# fewer levels.
 _RATE_STEPS = 12
-# Of one level, so that neighbours of the starting level can be reached from the first step.
+# Measured in levels, so that the first step can reach the neighbours of the starting level.
 _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
-    """Spread one value per free cell over the pixels of the layout, and average back.
+    """Spread one value per free cell over the pixels of the layout, and average pixels back to cells.
 
-    With ``rows`` it maps only these rows of pixels; ``own`` selects their cells from all cells.
+    With ``rows``, the map covers only these rows of pixels; ``own`` selects their cells from all cells.
     """
 
     ring: Tensor
@@ -44,17 +45,17 @@ class CellMap(nn.Module):
             self.cells = (len(rows) // self.cell_px, self.cells[-1])
 
     def own(self, values: Tensor) -> Tensor:
-        """From one value per cell of the whole layout, those of the own rows."""
+        """Select the cells of the map's own rows from one value per cell of the whole layout."""
         return values[self._own]
 
     def forward(self, values: Tensor) -> Tensor:
-        """(..., *cells) to (..., size, size)."""
+        """Spread values over the pixels, (..., *cells) to (..., size, size)."""
         if self.radial:
             return values[..., self.ring]
         return values.repeat_interleave(self.cell_px, -1).repeat_interleave(self.cell_px, -2)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Mean over each cell of real or complex ``pixels`` (size, size); empty rings give 0."""
+        """Return the mean over each cell of real or complex ``pixels`` (size, size); empty rings give 0."""
         if not self.radial:
             blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
             return blocks.mean((-3, -1))
@@ -67,10 +68,10 @@ class CellMap(nn.Module):
 class GumbelLevels(nn.Module):
     """A categorical distribution over levels per cell, sampled with Gumbel-Softmax.
 
-    Jang, Gu and Poole 2017, arXiv:1611.01144; a sample is the expected level under the sampled weights.
+    A sample is the expected level under the sampled weights (Jang, Gu and Poole 2017, arXiv:1611.01144).
     """
 
-    # Factor on the learning rate, as logits have no range.
+    # Factor on the learning rate; logits have no range, so it is 1.
     rate_unit = 1.0
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -80,7 +81,7 @@ class GumbelLevels(nn.Module):
         self.logits = nn.Parameter(torch.zeros(layout.levels, *self.cells.cells))
 
     def sample(self, temperature: float, seed: int) -> Tensor:
-        """Levels on the pixels, float (1, 1, size, size); the same ``seed`` gives the same sample."""
+        """Sample levels on the pixels, float (1, 1, size, size); the same ``seed`` gives the same sample."""
         devices = [self.logits.device] if self.logits.is_cuda else []
         with torch.random.fork_rng(devices=devices):
             torch.manual_seed(seed)
@@ -89,7 +90,7 @@ class GumbelLevels(nn.Module):
         return self.cells(torch.tensordot(ladder, weights, dims=1))[None, None]
 
     def best_levels(self) -> Tensor:
-        """The most probable level of each cell, int64 (*cells)."""
+        """Return the most probable level of each cell, int64 (*cells)."""
         return self.logits.detach().argmax(0)
 
     @torch.no_grad()
@@ -101,7 +102,7 @@ class GumbelLevels(nn.Module):
 
     @torch.no_grad()
     def start_random(self, seed: int) -> None:
-        """Standard normal logits."""
+        """Start from standard normal logits."""
         generator = torch.Generator().manual_seed(seed)
         self.logits.copy_(torch.randn(self.logits.shape, generator=generator))
 
@@ -110,9 +111,9 @@ class GumbelLevels(nn.Module):
 
 
 class DirectLevels(nn.Module):
-    """One real level per cell, filtered where the layout says so.
+    """One real level per cell, filtered if the layout says so.
 
-    Rounding passes the gradient straight through when ``hard``.
+    With ``hard``, rounding passes the gradient straight through.
     """
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -124,18 +125,18 @@ class DirectLevels(nn.Module):
         self.filter_cells = layout.cell_filter_um / layout.cell_um
 
     def sample(self, temperature: float = 1.0, seed: int = 0, *, hard: bool = False) -> Tensor:
-        """Levels on the pixels, float (1, 1, size, size); this sample is not random."""
+        """Return levels on the pixels, float (1, 1, size, size); this sample is not random."""
         free, kept = self._filtered(), self._kept()
         level = free + ((kept.round() if hard else kept) - free).detach()
         return self.cells(level)[None, None]
 
     @torch.no_grad()
     def project(self) -> None:
-        """Clamp heights that an optimiser step moved out of the range."""
+        """Clamp levels that an optimiser step moved out of the range."""
         self.height.clamp_(0, self.levels - 1)
 
     def best_levels(self) -> Tensor:
-        """The nearest level of each cell, int64 (*cells)."""
+        """Return the nearest level of each cell, int64 (*cells)."""
         return self._kept().detach().round().long()
 
     @torch.no_grad()
@@ -145,13 +146,13 @@ class DirectLevels(nn.Module):
 
     @torch.no_grad()
     def start_random(self, seed: int) -> None:
-        """Uniform over the whole range."""
+        """Start from random levels, uniform over the whole range."""
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.rand(self.cells.of_all, generator=generator)
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Levels clamped to the range, which an optimiser may leave if it does not call ``project``."""
+        """Clamp levels to the range, which an optimiser may leave if it does not call ``project``."""
         return self._filtered().clamp(0, self.levels - 1)
 
     def _filtered(self) -> Tensor:
@@ -164,7 +165,8 @@ Parametrisation = GumbelLevels | DirectLevels
 def make_parametrisation(
     layout: LayoutSettings, search: SearchSettings, cells: CellMap | None = None
 ) -> Parametrisation:
-    """The free parameters named by ``search.parametrisation``; ``cells`` may cover a part of the layout.
+    """Make the free parameters that ``search.parametrisation`` names; ``cells`` may cover a part of the
+    layout.
 
     Raises:
         InputError: a filter over cells together with distributions over levels.

@@ -1,4 +1,6 @@
-"""Wanted phases (Gerchberg-Saxton for images, Fresnel for lenses) and the printed levels nearest to them."""
+"""Find the wanted phases (Gerchberg-Saxton for images, Fresnel for lenses) and the printed levels nearest to
+them.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,11 @@ from torch import Tensor
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import CellMap
 
-# Amplitude, relative to that of the element, below which a wave has no phase.
+# A wave has no phase if its amplitude is below this, relative to that of the element.
 _DARK = 1e-12
-# Starting from random phases on the whole circle, one in six pairs of neighbouring cells ends more than half
-# a wave apart, a step that printing rounds off and the search does not repair. A nearly flat start ends with
-# a third fewer such steps, and different seeds still give different results.
+# After a start from phases that are random on the whole circle, one in six pairs of neighbouring cells ends
+# more than half a wave apart. Printing rounds off such a step, and the search does not repair it. A nearly
+# flat start ends with a third fewer of these steps, and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -32,15 +34,15 @@ def gerchberg_saxton(
     counted: Tensor | None = None,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, list[float]]:
-    """A phase per cell whose propagated amplitude approaches sqrt(target).
+    """Find a phase per cell whose propagated amplitude approaches sqrt(target).
 
-    Each step replaces the propagated amplitude inside the output window, keeps the wave outside it, sends the
-    correction back with the adjoint and projects the result on the phases of the element: u' = Pi(u + P^H (a
-    exp(j arg P u) - P u)). Because the norm of P is at most one, this majorises the squared amplitude error,
-    which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al. 2007,
-    doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing; it trades that guarantee for
-    uniformity. The first phase is half a turn, the middle of levels that make a full wave, and up to a radian
-    more or less.
+    Each step replaces the propagated amplitude inside the output window and keeps the wave outside it. The
+    adjoint sends the correction back, and the result is projected on the phases of the element: u' = Pi(u +
+    P^H (a exp(j arg P u) - P u)). The norm of P is at most one, so this step majorises the squared amplitude
+    error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al.
+    2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing. It gains uniformity
+    but loses the guarantee. The start phases are half a turn, the middle of levels that make a full wave,
+    plus or minus up to a radian.
 
     Args:
         propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
@@ -90,7 +92,7 @@ def gerchberg_saxton(
 
 
 def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tensor:
-    """The phase per cell of a perfect lens: phi = k (f - sqrt(f^2 + r^2)), radian.
+    """Return the phase per cell of a perfect lens: phi = k (f - sqrt(f^2 + r^2)), radian.
 
     ``optics.distance_um`` is the focal length f.
     """
@@ -103,10 +105,11 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Levels nearest to a lens's ``phase`` after the constant phase shift that loses the least light.
+    """Return the levels nearest to a lens's ``phase``, after the constant phase shift that loses the least
+    light.
 
-    A stroke below one wave leaves a gap in the phase circle, and a constant phase moves that gap. The mean of
-    exp(j error) over the cells is the amplitude at the focus.
+    A stroke below one wave leaves a gap in the phase circle, and a constant phase shift moves this gap. The
+    mean of exp(j error) over the cells is the amplitude at the focus.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):
@@ -118,12 +121,12 @@ def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
 
 
 def printed_phase(level_heights_um: Sequence[float], optics: Optics) -> Tensor:
-    """Phase of each printed level, radian (levels,)."""
+    """Return the phase of each printed level, radian (levels,)."""
     return torch.tensor(level_heights_um) * (2 * math.pi / optics.wave_height_um)
 
 
 def nearest_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """The level whose printed phase is closest on the circle, int64, for each ``phase`` (radian)."""
+    """Return the level, int64, whose printed phase is closest on the circle to each ``phase`` (radian)."""
     distance = phase.new_full(phase.shape, math.inf)
     nearest = torch.zeros(phase.shape, dtype=torch.long, device=phase.device)
     for level, printed in enumerate(level_phase.tolist()):

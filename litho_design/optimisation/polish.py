@@ -1,4 +1,4 @@
-"""Polish of the printable layout: single-level changes, kept only if they lower the loss."""
+"""Polish a printable layout: change single levels, and keep the changes only if they lower the loss."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.commands.progress import progress
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import Objective
 
-# Share of the cells that a round changes at first.
+# Share of the cells that the first round changes.
 _FIRST_SHARE = 0.02
 
 
@@ -20,7 +20,7 @@ def polish_levels(
 ) -> tuple[Tensor, list[float]]:
     """Improve an integer layout by one-level moves of cells; the loss never rises.
 
-    The gradient at the integer layout ranks the moves, the best share of them is applied at once, and the
+    The gradient at the integer layout ranks the moves, and the best share of them is applied at once. This
     share is halved whenever the true loss of the changed layout does not fall.
 
     Args:
@@ -52,7 +52,9 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """First-order gain of the best one-level move of each cell, that move (-1 or +1), and the loss."""
+    """Estimate the gain of the best one-level move of each cell to first order; return gain, move (-1 or +1)
+    and loss.
+    """
     values = levels.float().requires_grad_()
     loss, _ = objective(cells(values)[None, None])
     (slope,) = torch.autograd.grad(loss, values)

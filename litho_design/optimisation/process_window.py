@@ -1,4 +1,4 @@
-"""Process window: random prints and optics that differ from the model, and models that differ."""
+"""The process window: random prints and optics that differ from the model, and models that differ."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# A print passes if no figure in dB falls further below that of the print as modelled, every other figure
-# keeps this share of it, and no error grows by more than the inverse.
+# A print passes if no figure in dB falls further than this below the print as modelled, every other figure
+# keeps this share, and no error grows by more than the inverse of this share.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
-# (1e-6 µm)^2, far below any height, keeps the root differentiable where all models agree.
+# (1e-6 µm)^2 is far below any height and keeps the root differentiable where all models agree.
 _SMALLEST_VARIANCE_UM2 = 1e-12
 _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um")
 
 
 class ProcessWindow(Record):
-    """Spread of prints and optics, and its weight in a search.
+    """The spread of prints and optics, and its weight in a search.
 
-    ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
+    ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. With ``samples`` above 0, a search minimises the mean loss of the worst ``tail`` share of that many
-    draws, which are the same in every iteration. The defaults are a guess; replace them by the spreads of
-    your printer. The fields of one measured data set vary by 13 % in gain, including the scale of the
-    microscope.
+    draws; every iteration uses the same draws. The defaults are guesses; replace them by the spreads of your
+    printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -66,7 +65,7 @@ class ProcessWindow(Record):
 
 
 def spreads(window: ProcessWindow) -> list[str]:
-    """Every spread of a window with its value and unit, for reports."""
+    """Return every spread of a window with its value and unit, for reports."""
     return [
         f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip()
         for leaf in leaves(window)
@@ -84,10 +83,11 @@ class Draw:
     optics: Optics
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
-        """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
+        """Apply this draw to a printed map (size, size), or to rings (n,) from the centre; return the height,
+        µm.
 
         A uniform offset changes no image, only the scores of heights. Rings are blurred along the radius
-        only, which is exact if they are much wider than the blur or far from the centre.
+        only, which is exact for rings that are far from the centre or much wider than the blur.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -95,13 +95,14 @@ class Draw:
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
-    """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one.
+    """Return ``count`` draws from ``window.seed``; a longer list begins with the draws of a shorter one.
 
-    ``unseen`` draws come from a separate stream: a yield must hold for prints that no search has used.
+    ``unseen`` draws come from a separate stream, because a yield must hold for prints that no search has
+    used.
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    # Five numbers per draw; a further spread needs its own stream, or all older draws would change.
+    # Each draw takes five numbers. A further spread needs its own stream, or all earlier draws would change.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -117,7 +118,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads with draws, in the search or in the yield, that cannot be propagated.
+    """Refuse spreads whose draws, in the search or in the yield, cannot be propagated.
 
     Raises:
         InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
@@ -132,7 +133,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    # The angular spectrum has no limit, but an image plane behind the element must stay behind it.
+    # The angular spectrum has no such limit, but an image plane behind the element must stay behind it.
     limit_um = min(lengths_um)
     if optics.propagation == "rayleigh-sommerfeld":
         limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
@@ -150,7 +151,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 class Yield(Record):
-    """Share of random prints that pass, its 95 % interval (Wilson), and the figures that decide."""
+    """The share of random prints that pass, its 95 % interval (Wilson), and the figures that decide."""
 
     draws: int
     passed: int
@@ -164,7 +165,7 @@ def measure_yield(
     modelled: Mapping[str, float],
     errors: Collection[str] = (),
 ) -> Yield:
-    """The share of drawn prints that pass, because their figures stay close to those of the print as
+    """Measure the share of drawn prints that pass because their figures stay close to those of the print as
     modelled.
 
     Args:
@@ -190,13 +191,13 @@ def measure_yield(
 
 
 def risk(losses: Tensor, tail: float) -> Tensor:
-    """The mean of the worst share of many losses."""
+    """Return the mean of the worst share of many losses."""
     worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """RMS over the area of the standard deviation among models, µm; differentiable.
+    """Return the standard deviation among models, µm, as an rms over the area; it is differentiable.
 
     A constant height is only a constant phase, so the mean of every print is subtracted first.
 
@@ -212,11 +213,11 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """``window`` with the spread of gain and offset, and their correlation, of measured prints.
+    """Return ``window`` with the spread and correlation of gain and offset of measured prints.
 
-    Each scan is fitted as height = gain * nominal + offset. The spread between scans includes the process,
-    the scale of the microscope from scan to scan and what the fit leaves over, so it is an upper bound of
-    the spread between prints. Locked scans are left out, so that a search never depends on them.
+    Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound of the
+    spread between prints: it also contains the changing scale of the microscope and what the fit leaves over.
+    Locked scans are left out, so that a search never depends on them.
 
     Args:
         store: a ``litho_data`` store with at least three scans outside its lock box.
@@ -235,7 +236,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     if len(fits) < 3:
         raise InputError(
             "process window",
-            got=f"{len(fits)} scans with structure, {len(locked)} locked scans left out",
+            got=f"{len(fits)} scans with structure ({len(locked)} locked scans are left out)",
             wanted="at least three",
         )
     gain, offset = np.array(fits).T
@@ -249,7 +250,9 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
 
 def blurred(height: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian blur of a map with mirrored borders, or of rings, mirrored at the centre and level outside."""
+    """Blur a map with mirrored borders, or rings that are mirrored at the centre and level outside, with a
+    Gaussian.
+    """
     import torch
     import torch.nn.functional as F
 

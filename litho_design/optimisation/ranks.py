@@ -1,4 +1,4 @@
-"""The processes that share an element: those started by torchrun, or only this one."""
+"""The processes that share an element: those that torchrun started, or only this one."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Ranks:
-    """The number of this process among all; sums and exchanges carry gradients."""
+    """The number of this process among all processes; sums and exchanges carry gradients."""
 
     rank: int = 0
     count: int = 1
 
     @classmethod
     def joined(cls) -> Ranks:
-        """Join the processes of torchrun, over gloo for processors and NCCL for GPUs; alone without it."""
+        """Join the processes that torchrun started, over gloo for processors and NCCL for GPUs; without
+        torchrun, stay alone.
+        """
         if int(os.environ.get("WORLD_SIZE", "1")) == 1:
             return cls()
         if not dist.is_initialized():
@@ -31,20 +33,23 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """This process in the names of files that each process writes; empty if it is alone."""
+        """Return the name of this process for files that each process writes; empty if it is alone."""
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
     def device(self, device: str | torch.device) -> str | torch.device:
-        """``device`` for this process; with ``cuda`` each process takes a GPU of its own."""
+        """Choose the device of this process; with ``cuda`` each process takes its own GPU."""
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
-        """The range among ``count`` items that belongs to a process, by default this one."""
+        """Return the range of items, out of ``count``, that belongs to a process; the default is this
+        process.
+        """
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)
 
     def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated flat.
+        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated into a flat
+        tensor.
 
         Args:
             parts: one tensor per process, real or complex, of one dtype.
@@ -61,7 +66,9 @@ class Ranks:
         return torch.view_as_complex(got) if sent.is_complex() else got
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum over the values of all processes, () float64; the gradient adds up what each makes of it."""
+        """Sum the values of all processes, () float64; in the gradient, the contributions of all processes
+        are added.
+        """
         own = values.sum(dtype=torch.float64)
         if self.count == 1:
             return own
@@ -71,11 +78,11 @@ class Ranks:
         return total
 
     def any(self, value: bool) -> bool:
-        """Whether ``value`` holds for any process; waits for all of them."""
+        """Return whether ``value`` is true in any process, after waiting for all of them."""
         return bool(self.total(torch.tensor([float(value)])) > 0)
 
     def wait(self) -> None:
-        """Wait until all processes are here."""
+        """Wait until all processes have reached this call."""
         if self.count > 1:
             dist.barrier()
 

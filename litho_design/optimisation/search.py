@@ -1,4 +1,5 @@
-"""The search loop of every task, from free parameters to printable levels, resumable from checkpoints."""
+"""The search loop of every task: it turns free parameters into printable levels and resumes from checkpoints.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +79,7 @@ def _step(
     settings: SearchSettings,
     iteration: int,
 ) -> float:
-    # The noise depends on seed and iteration only, so that a resumed run draws the same numbers.
+    # The noise depends only on seed and iteration, so that a resumed run draws the same numbers.
     seed = settings.seed * 1_000_003 + iteration
     optimiser.zero_grad(set_to_none=True)
     level = parameters.sample(settings.temperature(iteration), seed)
@@ -115,7 +116,9 @@ def _evaluate(
 
 
 def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) -> StepLR | ReduceLROnPlateau:
-    """The scheduler that lowers the rate of ``optimiser`` by the settings; the checkpoint holds its state."""
+    """Make the scheduler that lowers the rate of ``optimiser`` by the settings; the checkpoint stores its
+    state.
+    """
     factor, iterations = settings.rate_factor, settings.rate_iterations
     if settings.rate_schedule == "plateau":
         # PyTorch's default, a threshold relative to the loss, does not work for a negative loss.
@@ -126,7 +129,7 @@ def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) ->
 
 
 def lower_rate(schedule: StepLR | ReduceLROnPlateau, loss: float) -> None:
-    """Tell the scheduler that an iteration is done and that its sample had this loss."""
+    """Tell the scheduler that an iteration is finished, and the loss of its sample."""
     if isinstance(schedule, ReduceLROnPlateau):
         schedule.step(loss)
     else:

@@ -65,13 +65,13 @@ class SearchSettings(Record):
     seed: int = setting(0, "Seed of start and sampling", option="--seed")
 
     def temperature(self, iteration: int) -> float:
-        """Gumbel temperature: a half cosine from start to end."""
+        """Return the Gumbel temperature: half a cosine from start to end."""
         share = iteration / max(self.iterations - 1, 1)
         weight = (1 + math.cos(math.pi * share)) / 2
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The search of the paper, for holograms and lenses; each adds its own learning rate.
+# The search of the paper for holograms and lenses, each of which adds its own learning rate.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -84,7 +84,7 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """With further models in the search, the loss is their worst loss + weight * disagreement in waves."""
+    """If the search has further models, its loss is their worst loss + weight * disagreement in waves."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
 
@@ -94,7 +94,7 @@ class EnsemblePenalty(Record):
 
 
 class Fabrication(Record):
-    """A penalty on a layout in addition to the loss of its light: inside_weight * ``outside``."""
+    """A penalty on a layout, added to the loss of its light: inside_weight * ``outside``."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
 
@@ -123,7 +123,7 @@ class DesignSettings(Record):
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
-    """Settings of a task of your own, with changes by path, such as ``{"layout.size_px": 256}``.
+    """Return settings for your own task, with changes by path, such as ``{"layout.size_px": 256}``.
 
     Raises:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.
@@ -132,7 +132,8 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
 
 
 def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[str, Any] | None = None) -> S:
-    """Settings of a preset with changes by path; a ``variant`` among them replaces the given one.
+    """Return the settings of a preset, with changes by path; a ``variant`` among the changes replaces the
+    given one.
 
     Raises:
         InputError: no such preset, or what ``changed`` refuses.

@@ -1,1 +1,1 @@
-"""Layouts and the printers that print them: a frozen model, nominal heights, or the virtual fab."""
+"""Layouts and what prints them: a frozen model, nominal heights, or the virtual fab."""

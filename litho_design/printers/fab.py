@@ -1,7 +1,7 @@
 """The virtual fab as a judge: it prints finished layouts, but has no gradients to design with.
 
-It shares no code with the models and includes the effects that were hidden in their training prints, so it
-prints what the machine would have printed.
+The fab shares no code with the models and includes the effects that were hidden in their training prints. It
+therefore prints what the machine would have printed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ElementJob(Job):
     """A layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """The layout in a frame of level 0, in the middle of a write field of its own size."""
+        """Place the layout in a frame of level 0, in the middle of a write field as large as the frame."""
         framed = np.pad(self.level, GUARD_PX)
         return Canvas(framed, pitch_um, self.field_um, max(self.level.shape) * pitch_um)
 
@@ -37,8 +37,8 @@ class ElementJob(Job):
 class FabSimulator(nn.Module):
     """Print like the virtual fab of a ``truth.json``, with surface roughness but without scan effects.
 
-    It is called like a frozen model but has no gradients. The roughness is the same for every layout of one
-    size, so prints of several layouts differ only by their layouts.
+    The fab is called like a frozen model but has no gradients. The roughness is the same for every layout of
+    one size, so their prints differ only by the layouts.
     """
 
     name = "fab"
@@ -50,13 +50,14 @@ class FabSimulator(nn.Module):
         self.printer, self.noise = truth.printer, truth.noise
         self.knobs = KnobBoard([knob.setting for knob in truth.knobs], truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
-        # Everything that determines the print; its hash identifies the fab as weights identify a model.
+        # This text contains everything that determines the print; its hash identifies the fab as weights
+        # identify a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
         self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
 
     @torch.no_grad()
     def forward(self, layout_um: Tensor, pitch_um: float) -> Tensor:
-        """Printed height (b, 1, y, x), µm, of nominal heights of the same shape."""
+        """Return the printed height (b, 1, y, x), µm, of nominal heights of the same shape."""
         levels = (layout_um / self.printer.level_height_um).round().to(torch.uint8).cpu().numpy()
         prints = np.stack([self._print(level) for level in levels[:, 0]])[:, None]
         return torch.from_numpy(prints.astype(np.float32)).to(layout_um.device)
@@ -69,13 +70,13 @@ class FabSimulator(nn.Module):
 
 
 def is_fab(source: str | Path) -> bool:
-    """Whether ``source`` is a truth file of ``litho-data simulate``, or a folder with one."""
+    """Return whether ``source`` is a truth file of ``litho-data simulate``, or a folder with one."""
     path = Path(source)
     return path.name == Truth.FILE_NAME or (path / Truth.FILE_NAME).is_file()
 
 
 def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
-    """The fab of a truth file.
+    """Load the fab of a truth file.
 
     Raises:
         InputError: no truth file, or a layout with another pitch or level height, or with more levels, than
@@ -87,7 +88,7 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
         prints = getattr(fab.printer, name)
         if abs(prints - value) > 1e-9:
             raise InputError(
-                f"{name} of the layout", got=f"{value:g} µm", wanted=f"{prints:g} µm, what the fab prints"
+                f"{name} of the layout", got=f"{value:g} µm", wanted=f"{prints:g} µm, as the fab prints"
             )
     if layout.levels > fab.printer.levels:
         raise InputError("levels of the layout", got=layout.levels, wanted=f"at most {fab.printer.levels}")

@@ -49,12 +49,12 @@ class LayoutSettings(Record):
 
     @property
     def size_um(self) -> float:
-        """Side of the element, µm."""
+        """Return the side of the element, µm."""
         return self.size_px * self.pitch_um
 
     @property
     def ring_px(self) -> float:
-        """Width of a ring in pixels; it need not be a whole number.
+        """Return the width of a ring in pixels; it need not be a whole number.
 
         Raises:
             InputError: rings narrower than a pixel.
@@ -68,7 +68,7 @@ class LayoutSettings(Record):
 
     @property
     def cell_px(self) -> int:
-        """Pixels per cell side.
+        """Return the number of pixels along the side of a cell.
 
         Raises:
             InputError: cells that are not a whole number of pixels, or that do not fill the element.

@@ -1,4 +1,4 @@
-"""A printer for one element: layout levels in, printed height out."""
+"""A printer for one element: it turns layout levels into printed heights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ Precision = Literal["float32", "bfloat16"]
 class TilingCheck(Record):
     """Difference between a print computed as a whole and the same print in tiles.
 
-    For models with a finite reach this is rounding; for others (a Fourier operator) an error of the model.
+    For models with a finite reach the difference is rounding; for others (a Fourier operator) it is an error
+    of the model.
     """
 
     tile_px: int
@@ -36,7 +37,7 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """The printer of a design or a score; ``dataset`` is that of the model's training."""
+    """The printer of a design or a score; ``dataset`` is the dataset on which the model was trained."""
 
     name: str
     sha256: str
@@ -47,10 +48,10 @@ class PrinterRecord(Record):
 
 
 class Printer(nn.Module):
-    """A frozen lithography model, or no model at all, applied to one element.
+    """A frozen lithography model, or nominal heights, applied to one element.
 
-    The element stands alone on the substrate, but models continue their input beyond its edge; so
-    the layout is surrounded by a guard ring of level 0 before printing and cropped afterwards.
+    The element stands alone on the substrate, but models continue their input beyond its edge. The layout is
+    therefore surrounded by a guard ring of level 0 before printing, and the print is cropped.
 
     Args:
         simulator: a frozen model called as ``simulator(layout_um, pitch_um=...)``, or None for a
@@ -84,39 +85,41 @@ class Printer(nn.Module):
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """The card of the model; empty where there is none."""
+        """Return the card of the model; without a model, it is empty."""
         return getattr(self.simulator, "card", {})
 
     @property
     def only_judges(self) -> bool:
-        """Whether it prints without gradients, so that no layout can be searched through it."""
+        """Return whether the printer has no gradients, so that no layout can be searched through it."""
         return isinstance(self.simulator, FabSimulator)
 
     @property
     def depends_on_position(self) -> bool:
-        """Whether added effects may depend on the position in the write field, which a patch lacks."""
+        """Return whether added effects may depend on the position in the write field, which a patch lacks."""
         return bool(self.card.get("process_effects"))
 
     @property
     def device(self) -> torch.device:
-        """Device of the model, or of the waves where there is no model."""
+        """Return the device of the model or, without a model, that of the waves."""
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
-        """Printed height, µm (b, 1, size, size), of real ``level`` (b, 1, size, size)."""
+        """Print real ``level`` (b, 1, size, size); return the height, µm (b, 1, size, size)."""
         height_um = level * self.layout.level_height_um
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
-        """Printed height, µm, of a patch cut out of a layout (b, 1, y, x), without its outer ``halo_px``.
+        """Print a patch cut out of a layout (b, 1, y, x); return its height, µm, without the outer
+        ``halo_px``.
 
-        ``halo_px`` is that of the printer by default; ``strip_halo_px`` serves for two rows of pixels.
+        By default ``halo_px`` is the halo of the printer; ``strip_halo_px`` is enough for two rows of pixels.
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
     def print_in_tiles(self, around: Tensor, tile_px: int) -> Tensor:
-        """Printed height, µm (b, 1, y, x), of levels with the printer's halo on all sides, tile by tile.
+        """Print levels that include the printer's halo on all sides, tile by tile; return the height, µm (b,
+        1, y, x).
 
         The gradient prints each tile again, so memory grows with ``tile_px`` instead of the element. For
         models of finite reach the result equals that of ``forward`` up to rounding; for others
@@ -140,7 +143,7 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
-        """Compare the print of the whole element with separately printed tiles with halos.
+        """Compare the print of the whole element with separately printed tiles, each with a halo.
 
         Args:
             level: layout (1, 1, size, size).
@@ -156,7 +159,7 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Odd starts, because at a multiple of the model's own tile the tile would be compared with itself.
+        # Starts are odd, because a tile at a multiple of the model's own tile would be compared with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):
@@ -174,13 +177,13 @@ class Printer(nn.Module):
     def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
         """Run the networks of a frozen model in ``precision`` inside the block.
 
-        Other models stay in float32, as do heights, blurs and waves.
+        Other models stay in float32, and so do heights, blurs and waves.
         """
         at_precision = getattr(self.simulator, "at_precision", None)
         return nullcontext() if at_precision is None else at_precision(precision)
 
     def record(self) -> PrinterRecord:
-        """Name, hashes and guard ring, for the results."""
+        """Return name, hashes and guard ring of the printer, for results."""
         return PrinterRecord(
             name=self.name,
             sha256=self.weights_sha256(),
@@ -191,7 +194,9 @@ class Printer(nn.Module):
         )
 
     def weights_sha256(self) -> str:
-        """Hash of the present values of all parameters and buffers; a design run must not change it."""
+        """Return the hash of the present values of all parameters and buffers, which a design run must not
+        change.
+        """
         digest = hashlib.sha256()
         state = {} if self.simulator is None else self.simulator.state_dict()
         for name in sorted(state):
@@ -202,7 +207,7 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def level_heights_um(self) -> list[float]:
-        """Printed height of a wide uniform field of each level, µm, for the table of levels."""
+        """Return the printed height of a wide uniform field of each level, µm, for the table of levels."""
         if self._level_heights_um:
             return self._level_heights_um
         size = 2 * self.guard_px + 16
@@ -215,8 +220,8 @@ class Printer(nn.Module):
         return heights
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
-        """Print of ``height_um`` without its outer ``border_px``."""
-        # A frozen model computes only as much of the border as the rest needs.
+        """Print ``height_um``, and cut off the outer ``border_px``."""
+        # A frozen model computes only as much of the border as the inner part needs.
         inside: Callable[..., Tensor] | None = getattr(self.simulator, "inside", None)
         if inside is not None:
             return inside(height_um, border_px, pitch_um=self.layout.pitch_um)
@@ -230,10 +235,11 @@ class Printer(nn.Module):
 
 
 def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
-    """Widths in pixels of the guard ring, and of the halos of a patch and of two rows of pixels.
+    """Return the widths, in pixels, of the guard ring, of the halo of a patch, and of the halo of two rows of
+    pixels.
 
     A model that runs on tiles needs a whole tile around a patch. Two rows of pixels lie where two rows of
-    tiles are blended, and the mean of two tiles errs less than one.
+    tiles are blended, and the mean of two tiles has a smaller error than one.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

@@ -1,4 +1,4 @@
-"""Loading printers: from a folder of a frozen model, the zoo, a virtual fab, or none."""
+"""Load printers: from a folder of a frozen model, the zoo, or a virtual fab, or nominal heights."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# The zoo models that judge a design, one of each kind, except for ridge regression, which extrapolates badly
-# from smooth layouts.
+# The zoo models that judge a design: one of each kind. Ridge regressions are left out, because they
+# extrapolate badly from smooth layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 
@@ -27,7 +27,8 @@ def load_printer(
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> Printer:
-    """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
+    """Load the printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal
+    heights.
 
     The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is the printer's name in
     results, by default the model's own. A loaded printer is returned unchanged.
@@ -59,7 +60,7 @@ def load_printers(
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> dict[str, Printer]:
-    """Printers by name, from a mapping, or from NAME=MODEL, MODEL, ``none`` and loaded printers.
+    """Load printers by name, from a mapping, or from NAME=MODEL, MODEL, ``none`` and loaded printers.
 
     Raises:
         InputError: one without a name, two of the same name, or what ``load_printer`` refuses.
@@ -87,8 +88,8 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Judges from the zoo that were trained on the same prints as the first ``known`` model, without known
-    models.
+    """Return judges from the zoo that were trained on the same prints as the first ``known`` model, except
+    known models.
 
     A model that was not calibrated for the layout is left out.
     """
@@ -97,7 +98,7 @@ def models_at_hand(
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
-        # Selected by their cards, so that models of another printer need not be loaded.
+        # They are selected by their cards, so that models of another printer need not be loaded.
         card = zoo.card(name)
         if (card.get("dataset") or {}).get("sha256") != dataset:
             continue

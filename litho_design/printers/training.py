@@ -1,4 +1,4 @@
-"""Compare a layout with a model's training layouts: distance, penalty, and the model's own error."""
+"""Compare a layout with a model's training layouts: its distance, a penalty, and the model's own error."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from litho_design.printers.layout import LayoutSettings
 if TYPE_CHECKING:
     from torch import Tensor
 
-# If half of the pixels have levels that are rare in the training layouts, the print is mostly extrapolated.
+# If half of the pixels have levels that are rare in the training layouts, most of the print is extrapolated.
 _FLAG_DISTANCE = 0.5
-# A tenth of all neighbours, because a few edges do not make a layout unusual.
+# The limit is a tenth of all neighbours, because a few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
 # A layout may have a level or step this many times as often as the training layouts, or by this share more.
 ALLOWED_TIMES = 2.0
@@ -25,11 +25,11 @@ _ALLOWED_SHARE = 0.005
 
 
 class OutOfDistribution(Record):
-    """Distance of a layout from the model's training layouts.
+    """The distance of a layout from the model's training layouts.
 
-    Two total-variation distances: between the histograms of levels, and between those of the steps of
-    neighbouring pixels. ``unusual`` says what the layout has much more of. Steps are absent if the model's
-    card has none.
+    It consists of two total-variation distances: between histograms of levels, and between histograms of the
+    steps of neighbouring pixels. ``unusual`` says what the layout has much more of than the training layouts.
+    Steps are absent if the model's card has none.
     """
 
     # Older designs also hold scores of a layout closer to the training layouts.
@@ -71,12 +71,12 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """The excess of a layout over twice the tails of a model's training layouts, in levels.
+    """Return the excess of a layout over twice the tails of a model's training layouts, in levels.
 
-    For every k, three shares are compared: of pixels at level k or lower, of pixels at k or higher, and of
+    For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
     neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
-    training layouts; 0 if the card has none. A sum of tails, unlike a sum of shares, also attracts a pixel
-    that is several levels outside.
+    training layouts. It is 0 if the card has no histogram. A sum of tails, unlike a sum of shares, also pulls
+    back a pixel that is several levels outside.
     """
     total = level.new_zeros(())
     trained, trained_steps = (
@@ -97,7 +97,9 @@ def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
-    """A histogram from a model's card over at least ``levels`` values, sum 1; None if the card has none."""
+    """Return a histogram from a model's card, over at least ``levels`` values and with sum 1; None if the
+    card has none.
+    """
     trained = np.asarray(card.get(name) or [], dtype=float)
     if trained.size == 0:
         return None
@@ -107,12 +109,12 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
 def own_error_um(
     card: Mapping[str, Any], height_um: Tensor, pitch_um: float, relief_um: float
 ) -> Tensor | float:
-    """Expected rms error of a model on a print (ny, nx), µm, from its errors on the prints in its card.
+    """Estimate the rms error of a model on a print (ny, nx), µm, from its errors on the prints in its card.
 
-    It grows with the square of the rms slope, because models err at edges, or with the standard deviation of
-    the wanted relief, if these exceed those of the card's prints. The scatter of the prints' gains is added.
-    Errors are taken as normal, so the mean absolute error is sqrt(2 / pi) of the rms error. 0 if the card has
-    no prints.
+    The error grows with the square of the rms slope, because models err at edges, or with the standard
+    deviation of the wanted relief, if these exceed those of the card's prints. The scatter of the prints'
+    gains is added. Errors are taken as normal, so the mean absolute error is sqrt(2 / pi) of the rms error.
+    If the card has no prints, the result is 0.
     """
     import torch
 
@@ -135,7 +137,7 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """Describe what ``share`` has much more of than ``trained``; empty if nothing."""
+    """Describe what ``share`` has much more of than ``trained``; return an empty list if nothing."""
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:
         return []

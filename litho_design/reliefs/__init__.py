@@ -1,1 +1,1 @@
-"""Reliefs: layouts whose print is a wanted height map."""
+"""Design reliefs: layouts whose print comes closest to a wanted height map."""

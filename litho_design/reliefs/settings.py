@@ -11,7 +11,7 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ReliefSettings(DesignSettings):
-    """All settings of one relief; wavelength and distance only matter for the stroke in the report."""
+    """All settings of one relief; wavelength and distance affect only the stroke in the report."""
 
     layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
     search: SearchSettings = setting(
@@ -31,7 +31,7 @@ class ReliefSettings(DesignSettings):
 
 
 def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:
-    """Settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
+    """Return the settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
 
     Raises:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.

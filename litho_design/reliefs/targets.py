@@ -1,4 +1,4 @@
-"""Wanted height maps: drawn by code, or read from a file."""
+"""Draw wanted height maps by code, or read them from a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PERIODS, _STEPS = 4, 6
 def load_relief(
     source: str | Path | np.ndarray, layout: LayoutSettings, height_um: float
 ) -> tuple[np.ndarray, TargetRecord]:
-    """A wanted height map, float32 (size, size), µm, and its record.
+    """Load a wanted height map, float32 (size, size), µm, and its record.
 
     Args:
         source: lens (a spherical cap), blaze (four periods of a sawtooth along x) or staircase (six steps
@@ -47,9 +47,10 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Deviation of a print (size, size) from its expectation, µm, blurred and without its mean: float32.
+    """Return the deviation of a print (size, size) from its expectation, µm, blurred and without its mean:
+    float32.
 
-    The roughness of a second print will differ from that of the first, so the blur removes it.
+    A second print will have other roughness than the first, so the blur removes the roughness.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -58,7 +59,7 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
 
 
 def _float_tiff(path: Path) -> np.ndarray | None:
-    """Heights in µm from a TIFF of floating-point numbers; None for any other file."""
+    """Read heights in µm from a TIFF of floating-point numbers; return None for any other file."""
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None
     import tifffile
@@ -68,7 +69,7 @@ def _float_tiff(path: Path) -> np.ndarray | None:
 
 
 def _draw(name: str, size_px: int) -> np.ndarray:
-    """A relief in [0, 1] on (size, size) pixels."""
+    """Draw a relief in [0, 1] on (size, size) pixels."""
     x = (np.arange(size_px) + 0.5) / size_px
     if name == "blaze":
         return np.tile(_PERIODS * x % 1, (size_px, 1))
@@ -85,5 +86,5 @@ def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
             "relief", got=f"{found.shape} px", wanted=f"({size_px}, {size_px}) px, the element's"
         )
     if not np.isfinite(found).all() or np.ptp(found) == 0:
-        raise InputError("relief", got="heights that are all equal or not numbers", wanted="a relief in µm")
+        raise InputError("relief", got="heights that are all equal or not numbers", wanted="finite heights in µm that differ")
     return found

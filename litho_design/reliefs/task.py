@@ -1,4 +1,4 @@
-"""The relief as a task: the layout whose print comes closest to a wanted height map."""
+"""The relief as a task: find the layout whose print comes closest to a wanted height map."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# Gains of an affine layout relative to the inverse of the printer's gain; positions between the ends of the
-# levels.
+# Gains of an affine layout relative to the inverse of the printer's gain; positions between the lowest and
+# the highest level.
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
-    """Height errors of a print without their mean, because the zero of a print depends on its base."""
+    """Errors of a print's height after its mean is removed, because the zero of a print depends on its base.
+    """
 
     rms_nm: float = Field(description="rms error of the print, offset free, nm")
     mae_nm: float = Field(description="mean absolute error, offset free, nm")
@@ -41,7 +42,7 @@ class ReliefScore(Record):
 
 
 class _Bare(nn.Module):
-    """The bench of a relief: what is seen is the relief itself."""
+    """The bench of a relief, which returns the relief itself."""
 
     def __init__(self, layout: LayoutSettings):
         super().__init__()
@@ -55,7 +56,7 @@ class _Bare(nn.Module):
 class ReliefTask(Task):
     """A wanted height map (size, size), µm, as ``load_relief`` gives it with its record.
 
-    The input ``off_um`` is the deviation of a first print from its expectation, without its mean; the search
+    The input ``off_um`` is the deviation of a first print from its expectation, without its mean. The search
     expects the same deviation again. Figures describe the print alone, as others will measure it.
 
     Raises:
@@ -82,7 +83,7 @@ class ReliefTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # The height that the model has to print so that the printer prints the target.
+        # The height that the model has to print for the printer to print the target.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
@@ -94,21 +95,22 @@ class ReliefTask(Task):
             )
 
     def make_bench(self, optics: Optics) -> Any:
-        """The print itself, whatever the light."""
+        """Return a bench that gives the print itself, whatever the light."""
         return _Bare(self.settings.layout).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Rms error without its mean, µm."""
+        """Return the rms error after the mean is removed, µm."""
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """The expected rms error, µm, from the error of the model's print and the model's own error."""
+        """Return the expected rms error, µm, from the error of the model's print and the model's own error.
+        """
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Errors, nm."""
+        """Return the errors of the print, nm."""
         error = 1000 * (seen - self.target).double()
         free = (error - error.mean()).abs()
         return {
@@ -119,35 +121,42 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Errors except for the offset: the zero is free and must not decide whether a print passes."""
+        """Return the errors except for the offset: the zero is free and must not decide whether a print
+        passes.
+        """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels whose uniform print has the wanted height at the best zero, or the best affine levels."""
+        """Return the levels whose uniform print has the wanted height at the best zero, or the best affine
+        levels.
+        """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
         return min((*starts, self.cells.average(self._best_affine)), key=self._worst_loss)
 
     def untouched(self) -> dict[str, Tensor]:
-        """The layout with the wanted heights unchanged, and the best affine layout."""
+        """Return the layout with the wanted heights unchanged, and the best affine layout."""
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Errors of the two layouts of ``untouched``, and of levels that need not be whole."""
+        """Return the errors of the two layouts of ``untouched``, and of levels that are not rounded."""
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
 
     @property
     def _nominal(self) -> Tensor:
-        """Levels (size, size) of the wanted heights; a relief that reaches below 0 is lifted to 0."""
+        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted to 0.
+        """
         return self._affine(
             1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
         )
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Levels (size, size) of the gain * height + zero whose worst error over the printers is lowest."""
+        """Return the levels (size, size) of the gain * height + zero whose worst error over the printers is
+        lowest.
+        """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
         unit = top * layout.level_height_um / (heights[-1] - heights[0])
@@ -162,8 +171,8 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Whole levels (size, size) of gain * (height above the lowest point) + zero, limited to the
-        printable levels.
+        """Return the whole levels (size, size) of gain * (height above the lowest point) + zero, limited to
+        the printable levels.
         """
         layout = self.settings.layout
         level = gain * (self.target - self.target.amin()) / layout.level_height_um + zero
@@ -171,22 +180,24 @@ class ReliefTask(Task):
 
     @torch.no_grad()
     def _worst_loss(self, levels: Tensor) -> float:
-        """Largest loss of real levels (*cells), rounded, over the printers of the search."""
+        """Return the largest loss of real levels (*cells), rounded, over the printers of the search."""
         whole = self.cells(levels.round())[None, None].float()
         return max(float(self.loss_by(printer, printer(whole)[0, 0])[0]) for printer in self.printers)
 
     def thick_score(self, height_um: Tensor) -> None:
-        """None: heights do not depend on the light."""
+        """Return None, because heights do not depend on the light."""
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The task's arrays, and the error that remains even with real levels, a lower limit for layouts."""
+        """Return the task's arrays, and the error that remains with unrounded levels, a lower limit for all
+        layouts.
+        """
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
     def _free_print(self) -> Tensor:
-        """The print with the lowest loss of levels that need not be whole, µm."""
+        """Return the print, µm, of unrounded levels with the lowest loss."""
         free = DirectLevels(self.settings.layout).to(self.printer.device)
         free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
 
@@ -201,7 +212,8 @@ class ReliefTask(Task):
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
     ) -> Tensor:
-        """Real levels (*cells) that print a relief's heights if level k is ``level_heights_um[k]`` high.
+        """Return real levels (*cells) that print a relief's heights, if level k is ``level_heights_um[k]``
+        high.
 
         ``zero`` places the relief between the lowest (0) and the highest level (1).
         """
@@ -212,6 +224,6 @@ class ReliefTask(Task):
         return self.cells.average(torch.from_numpy(levels).float().to(self.printer.device))
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Heights over the range of the target."""
+        """Scale heights to the range of the target."""
         target = self.inputs["relief_um"]
         return (seen - seen.min()) / np.ptp(target)

@@ -1,1 +1,1 @@
-"""HTML reports of designs, scores and comparisons."""
+"""Write HTML reports of designs, scores and comparisons."""

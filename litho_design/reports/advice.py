@@ -25,7 +25,7 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures that summarise a score, if it has them: text, decimals, and a factor.
+# Figures that summarise a score, if it contains them: text, decimals, and a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -46,17 +46,19 @@ _SEEN_SHARE = 0.02
 
 
 def named(figure: str) -> str:
-    """The readable name of a score's figure."""
+    """Return the readable name of a score's figure."""
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
 def called(printer: str) -> str:
-    """A printer in a sentence."""
+    """Return the name of a printer as it appears in a sentence."""
     return "nominal heights" if printer == "none" else printer
 
 
 def distribution_warning(design: Design) -> str:
-    """A warning if a layout is far from the training layouts or the distance is unknown; else empty."""
+    """Warn if a layout is far from the training layouts, or if the distance is unknown; otherwise return an
+    empty text.
+    """
     gauge = design.out_of_distribution
     if gauge is None:
         if design.printer.source == "none" or LEVELS_FILE not in design.files:
@@ -76,7 +78,9 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """The prediction of the available models of the printer; empty if there is only the design's own."""
+    """State what the available models of the printer predict; return an empty text if there is only the
+    design's own.
+    """
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
         return ""
@@ -96,7 +100,7 @@ def width_sentence(design: Design) -> str:
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """A figure by the first model, in the median and at worst, and whether the models differ too much.
+    """State a figure by the first model, in the median and at worst, and whether the models differ too much.
 
     Args:
         less: whether the figure is better when lower; ``gain``: gain of the design over doing nothing.
@@ -117,7 +121,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
 
 
 def thickness_warning(design: Design) -> str:
-    """A warning if the same print performs clearly worse as a thick element; else empty."""
+    """Warn if the same print performs clearly worse as a thick element; otherwise return an empty text."""
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
         return ""
@@ -132,7 +136,7 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """The stroke of the printed levels, and the height of a full wave."""
+    """State the stroke of the printed levels and the height of a full wave."""
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
         f"The highest level prints {stroke.stroke_waves:.2f} waves above the lowest (gain "
@@ -156,7 +160,8 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """The summary of a score that a command prints at its end, with a measurement's uncertainty."""
+    """Return the summary of a score that a command prints at its end, with the uncertainty of a measurement.
+    """
     sd = uncertainty or {}
 
     def told(name: str, digits: int, scale: int = 1) -> str:
@@ -168,5 +173,5 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
 
 
 def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
-    """The headline figures of the baselines in one line."""
+    """State the headline figures of the baselines in one line."""
     return f"for comparison: {'; '.join(f'{name} {headline(one)}' for name, one in baselines.items())}"

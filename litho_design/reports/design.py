@@ -1,4 +1,4 @@
-"""The report of one design, whatever its task."""
+"""Write the report of one design, whatever its task."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
 
 
 def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
-    """Add the yield of random prints and their figures."""
+    """Add the yield of random prints and the figures of these prints."""
     window, errors = task.settings.window, task.errors
     draws = task.window_scores(print_um, window.yield_draws)
     passed = measure_yield(draws, design.predicted, errors)

@@ -1,4 +1,4 @@
-"""The report of a comparison: tables with intervals and the images in design and after printing."""
+"""Write the report of a comparison: tables with intervals, and the images in design and after printing."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from litho_design.reports.tables import meanings
 from litho_design.tasks.design import Design
 from litho_design.tasks.task import registered_task
 
-# With fewer seeds, an interval over them is missing or meaningless.
+# With fewer seeds, an interval over seeds is missing or meaningless.
 _FEWEST_SEEDS = 3
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
 def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequence[Panel]]) -> Path:
-    """Write ``report.html`` and one CSV per table; ``pictures``: of the first seed, one row per arm."""
+    """Write ``report.html`` and one CSV per table; ``pictures`` shows the first seed, with one row per arm.
+    """
     lens = result.task.startswith("lens-")
     what = result.task.replace("lens-", "lens, ").replace("-", " ")
     what = f"hologram of “{result.target}”" if result.task == "hoe" else what
@@ -85,12 +86,12 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
 
 
 def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
-    """Mean and interval of a figure under a judge, by arm."""
+    """Return the mean and interval of a figure under a judge, by arm."""
     return {one.arm: one for one in result.summary if (one.judge, one.figure) == (judge, figure)}
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """The best arm under each judge that is no arm, or else under every judge."""
+    """Name the best arm under each judge that is not an arm; if all judges are arms, under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1
     unit = " dB" if figure.endswith("_db") else ""
@@ -128,7 +129,7 @@ def _caption(task: str, figure: str) -> str:
 
 
 def _label(figure: str) -> str:
-    """The meaning of a figure; figures of your own tasks have only a name."""
+    """Return the meaning of a figure; a figure of your own task has only a name."""
     return _LABELS.get(figure) or named(figure)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of designs and scores: maps side by side, the curves of a lens, the course of a search."""
+"""Draw designs and scores: maps side by side, the curves of a lens, the course of a search."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ if TYPE_CHECKING:
 
     from litho_design.lenses.bench import LensBench
 
-# Brightest intensity shown, in units of the target's white; speckle beyond it is clipped.
+# Brightest intensity shown, relative to the target's white; brighter speckle is clipped.
 BRIGHTEST = 1.5
 _GREY, _BLUE, _GREEN = "#9aa7b5", "#2f7fd0", "#3a9142"
-# Side of a map with axes and a colour bar, and of one without, inches.
+# Side of a map with axes and a colour bar, and of a map without them, inches.
 _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map (m, m), ``side_um`` wide, in a colour map of matplotlib; with a unit it has a colour bar."""
+    """A map (m, m), ``side_um`` wide, in a colour map of matplotlib; if it has a unit, it has a colour bar.
+    """
 
     title: str
     values: np.ndarray
@@ -35,7 +36,7 @@ class Panel(NamedTuple):
 
 
 def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
-    """Panels in rows and columns."""
+    """Draw panels in rows and columns."""
     columns, side = max(map(len, rows)), _LARGE if rows[0][0].unit else _SMALL
     figure = new_figure(side * columns + 0.6, (side + 0.2) * len(rows))
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -53,7 +54,7 @@ def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
 
 
 def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> Figure:
-    """Loss against iteration."""
+    """Draw the loss against the iteration."""
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     for name, label, colour in (
@@ -69,12 +70,12 @@ def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> F
 
 
 def decibels(psf: np.ndarray) -> np.ndarray:
-    """A PSF in decibels below its peak."""
+    """Convert a PSF to decibels below its peak."""
     return 10 * np.log10(np.maximum(psf, 1e-12) / psf.max())
 
 
 def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Figure:
-    """Print along the central row, PSF and MTF beside those of a perfect lens."""
+    """Draw the print along the central row, and PSF and MTF with those of a perfect lens."""
     import torch
 
     from litho_design.lenses.score import mtf
@@ -106,7 +107,7 @@ def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Fig
 def yield_figure(
     draws: Sequence[Mapping[str, float]], figures: Mapping[str, tuple[float, str]], falling: Sequence[str]
 ) -> Figure:
-    """Share of drawn prints that are at least as good as the value on the axis.
+    """Draw the share of drawn prints that are at least as good as the value on the axis.
 
     Args:
         draws: figures of each print.

@@ -1,4 +1,4 @@
-"""The report of one score."""
+"""Write the report of one score."""
 
 from __future__ import annotations
 
@@ -82,7 +82,9 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """The design's own figure beside those of its judging models; empty with fewer than two models."""
+    """State the design's own figure and those of its judging models; return an empty text with fewer than two
+    models.
+    """
     task = registered_task(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
     judged = {one.judge.name: one.figures.get(figure) for one in result.scores if one.kind == "model"}
@@ -92,7 +94,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """The difference from the expectation, in the figure that compares holograms."""
+    """State the difference from the expectation, in the figure that compares holograms."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

@@ -1,4 +1,4 @@
-"""Tables of figures, levels and distances that reports share."""
+"""Tables of figures, levels and distances, shared by several reports."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from litho_design.tasks.design import Design
 
 
 def meanings(score: type[Record]) -> dict[str, str]:
-    """The meaning of each number of a score."""
+    """Return the meaning of each number of a score."""
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """One row per figure, one column per print or baseline, and the meaning of each figure."""
-    # A task of your own need not describe its figures.
+    """Return one row per figure and one column per print or baseline, with the meaning of each figure."""
+    # Your own task need not describe its figures.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels
     )
@@ -33,7 +33,7 @@ def score_table(
 
 
 def level_table(design: Design) -> dict[str, Any]:
-    """Level, nominal and printed height, and printed waves above level 0."""
+    """Return the level, nominal and printed height, and printed waves above level 0."""
     printed, step_um = design.stroke.printed_height_um, design.layout.level_height_um
     wave_um = design.optics.wave_height_um
     return {

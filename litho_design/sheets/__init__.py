@@ -1,1 +1,1 @@
-"""A sheet of prints for a lab to make, and the evaluation of its scans."""
+"""Make a sheet of prints for a lab, and evaluate its scans."""

@@ -1,4 +1,4 @@
-"""A sheet for a lab to print and scan: layouts, witness patterns, and two versions of a hologram."""
+"""Make a sheet for a lab to print and scan: layouts, witness patterns, and two versions of a hologram."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# Cut-offs of the random layouts in turn, those of the measured prints, cycles per µm.
+# Cut-offs of the random layouts, used in turn; the measured prints have the same, cycles per µm.
 _CUTOFFS_PER_UM = (0.25, 0.5)
-# Few wide steps, because the stair takes three fifths of a side and the printer rounds its edges.
+# Few wide steps, because the stair takes three fifths of a side and the printer rounds the edges of steps.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
@@ -118,7 +118,7 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """The fields to learn from, by id: the witnesses first, then random layouts."""
+    """Return the fields to learn from, by id: first the witnesses, then random layouts."""
     shape = geometry.size_px, geometry.size_px
 
     def random(number: int) -> np.ndarray:
@@ -143,7 +143,7 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
 def _exported(
     source: np.ndarray | Path, format: Format, folder: Path, name: str, geometry: LayoutSettings
 ) -> str:
-    """Write the printer's file of a field; returns its path within the sheet."""
+    """Write the printer's file of a field; return its path within the sheet."""
     size = geometry.pitch_um, geometry.level_height_um
     file = export(source, format, folder / TO_PRINTER / name, pitch_um=size[0], level_height_um=size[1])
     return file.relative_to(folder).as_posix()

@@ -1,4 +1,4 @@
-"""Evaluate the scans of a sheet: a dataset, a model with its card, a closed loop and a comparison."""
+"""Evaluate the scans of a sheet: make a dataset, a model with its card, a closed loop and a comparison."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, 
 from litho_design.workflows.score import score
 from litho_models import close_loop, evaluate, freeze
 
-# A sheet has too few scans for a larger number.
+# A sheet has too few scans for a model with more parameters.
 _BASE = "physics"
 
 
@@ -77,7 +77,7 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
 
 
 def sheet_text(result: ReadSheet) -> str:
-    """The answer in two sentences."""
+    """State the answer in two sentences."""
     gain = {kind: db["with"] - db["without"] for kind, db in _by_kind(result).items()}
     better = "better" if gain["measured"] >= 0 else "worse"
     return (

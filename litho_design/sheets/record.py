@@ -15,7 +15,7 @@ HOLOGRAM, SCANS_OF_HOLOGRAMS = "hologram", "hologram-scans"
 
 
 class Field(Record):
-    """One field of a sheet: its number in the order of printing, its file and what it is for."""
+    """One field of a sheet: its number in the order of printing, its file and its purpose."""
 
     order: int
     id: str
@@ -24,7 +24,8 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """The sheet for a lab; ``expected_db``: SI-PSNR of each hologram's image, predicted by ``model``."""
+    """The sheet for a lab; ``expected_db`` is the SI-PSNR of each hologram's image that ``model`` predicts.
+    """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet/1"
     FILE_NAME: ClassVar[str] = "sheet.json"

@@ -1,4 +1,6 @@
-"""Light through a printed element onto a window of its size, for one or several sets of optics."""
+"""Propagate light through a printed element onto a window of the same size, for one or several sets of
+optics.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,10 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ElementBench(nn.Module):
-    """Light of a source through a printed element onto the image plane (element and window of equal size).
+    """Propagate the light of a source through a printed element onto the image plane; element and window have
+    equal size.
 
-    ``propagator`` belongs to the middle of the source.
+    ``propagator`` is the one for the middle of the source.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):
@@ -25,24 +28,28 @@ class ElementBench(nn.Module):
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.parts = coherent_parts(optics, layout.size_um)
         colours = {optics.wavelength_um: optics} | {part.wavelength_um: part for _, part in self.parts}
-        # Neither direction nor resin changes the propagation behind the element.
+        # Neither the direction of light nor the resin changes the propagation behind the element.
         self.carried = nn.ModuleDict(
             {_key(um): make_propagator(self.grid, self.grid, one, dtype=dtype) for um, one in colours.items()}
         )
 
     @property
     def propagator(self) -> Any:
-        """From the element to the image plane, for the middle wavelength."""
+        """Return the propagator from the element to the image plane, for the middle wavelength."""
         return self.carried[_key(self.optics.wavelength_um)]
 
     def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
-        """Plane waves of the source in the image plane (..., size, size), with their shares of the light."""
+        """Yield plane waves of the source in the image plane (..., size, size), each with its share of the
+        light.
+        """
         for share, part in self.parts:
             wave = element_field(height_um, self.grid, part)
             yield share, self.carried[_key(part.wavelength_um)](wave)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Share of the incident power on each pixel of the window, of heights (..., size, size) in µm."""
+        """Return the share of the incident power on each pixel of the window, for heights (..., size, size)
+        in µm.
+        """
         found = [share * intensity_share(wave, self.grid) for share, wave in self.waves(height_um)]
         return sum(found[1:], found[0])
 
@@ -53,7 +60,9 @@ def _key(wavelength_um: float) -> str:
 
 
 class ViewsBench(nn.Module):
-    """The images behind one element in several optics: colours, planes, angles of incidence."""
+    """Form the images behind one element under several optical conditions: colours, planes, angles of
+    incidence.
+    """
 
     def __init__(self, layout: LayoutSettings, views: Sequence[Optics]):
         super().__init__()
@@ -61,5 +70,5 @@ class ViewsBench(nn.Module):
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Shares of the incident power (views, size, size) of a height (size, size), µm."""
+        """Return shares of the incident power (views, size, size) for a height map (size, size), µm."""
         return torch.stack([bench(height_um) for bench in self.benches])

@@ -1,4 +1,4 @@
-"""A finished design as a folder: the record in design.json, levels, predicted print and image."""
+"""A finished design as a folder: the record in design.json, with levels, predicted print and image."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
-# For a lens of rings: one value per pixel of the radius instead of levels and heights of a plane.
+# A lens of rings has one value per pixel of the radius, instead of levels and heights of a plane.
 RINGS_FILE = "ring_level.npy"
 RING_HEIGHT_FILE = "ring_height_um.npy"
-# Folder of the designs of a result that contains several.
+# Folder of the designs, if a result contains several.
 DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device and duration of a run, including interrupted runs."""
+    """Command, software, device and duration of a run, interrupted runs included."""
 
     device: str
     threads: int
@@ -45,7 +45,7 @@ class RunRecord(RunFacts):
 
     @classmethod
     def of(cls, device: torch.device, seconds: float, seconds_per_iteration: float) -> RunRecord:
-        """The record of the run that this process is finishing."""
+        """Make the record of the run that this process is finishing."""
         return cls(
             **run_facts(),
             device=str(device),
@@ -57,7 +57,9 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """Findings of a task about its levels and their print; ``thick``: figures as a thick element."""
+    """What a task finds out about its levels and their print; ``thick`` contains the figures as a thick
+    element.
+    """
 
     tiling: TilingCheck | None = None
     out_of_distribution: OutOfDistribution | None = None
@@ -95,17 +97,17 @@ class Design(Findings, Result):
 
     @property
     def in_rings(self) -> bool:
-        """Whether it has levels and heights along a radius instead of a plane."""
+        """Return whether the design has levels and heights along a radius instead of a plane."""
         return RINGS_FILE in self.files
 
     @property
     def layout_sha256(self) -> str:
-        """Hash of the file of levels."""
+        """Return the hash of the file of levels."""
         return self.files[RINGS_FILE if self.in_rings else LEVELS_FILE]
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
-    """Save arrays by file name, and levels also as a 16-bit grey PNG; returns their SHA-256."""
+    """Save arrays by file name, and levels also as a 16-bit grey PNG; return their SHA-256."""
     hashes = {}
     for name, array in arrays.items():
         with atomic_file(folder / name) as temporary, open(temporary, "wb") as stream:
@@ -123,7 +125,8 @@ def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
 
 
 def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:
-    """One array of a design folder, checked against the hash in its record; ``on_disk`` maps the file.
+    """Read one array of a design folder and check it against the hash in its record; ``on_disk`` maps the
+    file.
 
     Raises:
         InputError: no such file, or one that changed after the design.
@@ -133,6 +136,6 @@ def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.nd
     if wanted is None or not path.exists():
         raise InputError(f"array {name}", got=f"no such file in {folder}", wanted="a complete design folder")
     if file_sha256(path) != wanted:
-        raise InputError(f"array {path}", got="a file changed after the design", wanted=f"SHA-256 {wanted}")
+        raise InputError(f"array {path}", got="a file that changed after the design", wanted=f"SHA-256 {wanted}")
     found: np.ndarray = np.load(path, mmap_mode="r" if on_disk else None, allow_pickle=False)
     return found

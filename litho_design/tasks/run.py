@@ -1,4 +1,4 @@
-"""The run that every task shares: start, search, polish, score, write; interrupted runs resume."""
+"""Run any task: start, search, polish, score and write; interrupted runs resume."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# Layouts that every model prints: the searched and the uncorrected one. Seconds that a page takes.
+# How many layouts every model prints: the searched and the uncorrected one. How many seconds a page takes.
 _CANDIDATES, _PAGE_S = 2, 7.0
-# Writes the report into the folder of a design, from the record and the history of the search.
+# A function that writes the report into the folder of a design, from the record and the history of the
+# search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 
 
 def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = True) -> Design:
     """Optimise, polish and score one layout, and write the folder ``out``.
 
-    If the folder holds an interrupted run of the same task, the run resumes, with the same result as an
-    uninterrupted one; a finished design of the same task is returned. The weights of every model are hashed
+    If the folder holds an interrupted run of the same task, the run resumes, and its result equals that of an
+    uninterrupted run. A finished design of the same task is returned. The weights of every model are hashed
     before and after the run; if they changed, no design is written.
 
     Args:
@@ -57,7 +58,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         "target": task.target_record.model_dump(mode="json") if task.target_record else None,
         "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
     }
-    # The first of the processes that share a design keeps the folder.
+    # The first of the processes that share a design writes the folder.
     with growing_folder(folder, Design.FILE_NAME, facts) if task.ranks.rank == 0 else nullcontext() as begun:
         if not task.ranks.any(begun is not None and begun.finished):
             _make(task, folder, facts, before, report, announce and task.ranks.rank == 0)
@@ -74,7 +75,7 @@ def _make(
     report: Report,
     announce: bool,
 ) -> None:
-    """Search, choose, print, score and write."""
+    """Search, choose a layout, print, score and write."""
     settings = task.settings
     layout, wave_um = settings.layout, settings.optics.wave_height_um
     heights = task.printer.level_heights_um()
@@ -126,7 +127,7 @@ def _make(
 
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
-    """The candidate whose largest loss over the available models is smallest.
+    """Choose the candidate whose largest loss over the available models is smallest.
 
     Args:
         searched: levels of the search on the pixels (size, size).
@@ -160,7 +161,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
 
 
 class _Searched(NamedTuple):
-    """Levels per cell after search and polish with their loss, the search itself, and its costs."""
+    """The levels per cell after search and polish with their loss, the search itself, and its costs."""
 
     levels: Tensor
     loss: float
@@ -199,7 +200,8 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Time of choice, scores and yield, from one print by each model and one draw of the yield."""
+    """Estimate the time of choice, scores and yield, from one print by each model and one draw of the yield.
+    """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()
     heights = [task.printed_um(level, one) for one in models]

@@ -1,4 +1,4 @@
-"""The interface of a task: what light should do behind a printed element."""
+"""The interface of a task: what the light behind a printed element should do."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from litho_design.tasks.design import (
 
 
 class Figures(Record):
-    """The figures of a task of your own, by name."""
+    """The figures of your own task, by name."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -44,9 +44,9 @@ class Figures(Record):
 class Task:
     """A goal for the light behind an element, which can be optimised and scored through printers.
 
-    For a task of your own, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``,
-    and pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report
-    and export work without changes.
+    For your own task, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``. Then
+    pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report and
+    export work without changes.
 
     Attributes:
         name: unique name of the task in results.
@@ -107,14 +107,15 @@ class Task:
         for optics in self.views(settings.optics):
             check_draws(settings.window, optics, self.bench.grid, self.bench.window)
 
-    # Methods that a task of your own defines.
+    # Methods that your own task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """The optics of every image: colours (``optics.at_wavelength``), planes, angles of incidence."""
+        """Return the optics of every image: colours (``optics.at_wavelength``), planes, angles of incidence.
+        """
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
-        """The loss of what is seen, by default shares of the incident power (views, size, size).
+        """Return the loss of what is seen, by default shares of the incident power (views, size, size).
 
         Returns:
             A scalar, or a scalar and its named parts.
@@ -122,21 +123,21 @@ class Task:
         raise NotImplementedError
 
     def figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Scores of what is seen, by name."""
+        """Return the scores of what is seen, by name."""
         raise NotImplementedError
 
     # Methods that holograms and lenses override.
 
     def make_cells(self) -> CellMap:
-        """The map from one value per free cell to the pixels of the search."""
+        """Return the map from one value per free cell to the pixels of the search."""
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """The optics, from a height map (size, size), µm, to what is seen."""
+        """Return the optics that turn a height map (size, size), µm, into what is seen."""
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels (*cells) at the start of the search, unless it starts at random.
+        """Return the levels (*cells) at the start of a search that does not start at random.
 
         Args:
             level_phase: phase that each level prints, radian (levels,).
@@ -144,7 +145,7 @@ class Task:
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Uncorrected layouts (size, size), by name: the start for nominal heights."""
+        """Return uncorrected layouts (size, size) by name: the start for nominal heights."""
         if set(self.starts) == {"random"}:
             return {}
         layout = self.settings.layout
@@ -156,28 +157,32 @@ class Task:
         """Refuse a printer that cannot print this task's layouts."""
 
     def search_bench(self, optics: Optics) -> Any:
-        """The bench of the search, from ``search_print`` to what the loss sees."""
+        """Return the bench of the search, which turns ``search_print`` into what the loss sees."""
         return self.make_bench(optics)
 
     def search_print(self, level: Tensor, printer: Printer) -> Tensor:
-        """Printed height of levels (1, 1, size, size), µm, for the search."""
+        """Print levels (1, 1, size, size) for the search; return the height, µm."""
         return self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
-        """Area that each height of ``search_print`` covers; None for pixels."""
+        """Return the area that each height of ``search_print`` covers; None for pixels."""
         return None
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Printed height (size, size), µm, of real levels (1, 1, size, size); gradients flow to them."""
+        """Print real levels (1, 1, size, size); return the height (size, size), µm, with gradients to the
+        levels.
+        """
         return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score of a print (size, size), µm, whose design expected ``expected_um``, by default the same."""
+        """Score a print (size, size), µm, whose design expected ``expected_um``, by default the print itself.
+        """
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score of a print as a thick element; None if the settings already say thick, or without light."""
+        """Score a print as a thick element; return None if the settings already say thick, or without light.
+        """
         if self.settings.optics.element == "thick":
             return None
         optics = self.settings.optics.model_copy(update={"element": "thick"})
@@ -186,15 +191,15 @@ class Task:
         return type(self)(settings, nominal, inputs=self.inputs).score(height_um)
 
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Figures of one draw of the process window."""
+        """Return the figures of one draw of the process window."""
         return self.figures(seen)
 
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write levels, print and what is seen; SHA-256 by file name."""
+        """Write levels, print and what is seen; return their SHA-256 by file name."""
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Findings about levels and their print, for the record; ``folder`` contains the arrays."""
+        """Return findings about levels and their print, for the record; ``folder`` contains the arrays."""
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(
@@ -207,7 +212,7 @@ class Task:
         )
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The arrays of a design by file name: levels, heights, what is seen, and the inputs."""
+        """Return the arrays of a design by file name: levels, heights, what is seen, and the inputs."""
         with torch.no_grad():
             seen = self.bench(height_um).cpu().numpy()
         levels = level.cpu().numpy().astype(np.uint8)
@@ -215,16 +220,19 @@ class Task:
         return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Efficiency of an ideal element found from a print (size, size), µm; None if that is undefined."""
+        """Return the efficiency of an ideal element found from a print (size, size), µm; None if that is
+        undefined.
+        """
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Baseline scores on the same grid, by default those of a flat plate."""
+        """Return baseline scores on the same grid, by default those of a flat plate."""
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """What is seen, for reports: images divided by their brightest value, side by side in a square."""
+        """Draw what is seen for reports: images divided by their brightest value, side by side in a square.
+        """
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
         tiles = np.zeros((side * side, *images.shape[1:]))
@@ -234,11 +242,11 @@ class Task:
         ]
         return np.concatenate(rows)
 
-    # What every task shares.
+    # Methods that every task shares.
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Draws of the process window in the loss, with their benches; without draws, the print as
+        """Return the draws of the process window in the loss, with their benches; without draws, the print as
         modelled.
         """
         window, optics = self.settings.window, self.settings.optics
@@ -248,7 +256,7 @@ class Task:
         ]
 
     def free_parameters(self) -> Parametrisation:
-        """Free parameters of the search, at its start."""
+        """Return the free parameters of the search, at its start."""
         search, optics = self.settings.search, self.settings.optics
         parameters = make_parametrisation(self.settings.layout, search, self.cells).to(self.printer.device)
         if search.start == "random":
@@ -260,10 +268,10 @@ class Task:
         return parameters
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of levels on the pixels (1, 1, size, size), and its parts.
+        """Return the loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models it is their worst loss plus their disagreement; with samples of the process window
-        it is the risk over them. The penalty on rare levels and steps is added.
+        With several models the loss is their worst loss plus their disagreement; with samples of the process
+        window it is the risk over the samples. The penalty on rare levels and steps is added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
@@ -289,12 +297,12 @@ class Task:
 
     @torch.no_grad()
     def printed_um(self, level: Tensor, printer: Printer | None = None) -> Tensor:
-        """Printed height, µm, of whole levels (size, size), by default through the first printer."""
+        """Print whole levels (size, size), by default with the first printer; return the height, µm."""
         return self.printed(level[None, None].float(), printer or self.printer)
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Figures of a print (size, size) over ``count`` unseen draws of the process window."""
+        """Score a print (size, size) over ``count`` unseen draws of the process window."""
         settings, scores = self.settings, []
         for draw in draws(settings.window, settings.optics, count, unseen=True):
             changed = draw.apply(height_um, settings.layout.pitch_um)
@@ -302,7 +310,7 @@ class Task:
         return scores
 
     def inputs_sha256(self) -> str:
-        """Hash of the inputs and, for a task from outside this package, of its code."""
+        """Return the hash of the inputs and, for a task from outside this package, of its code."""
         digest = hashlib.sha256()
         for name, array in sorted(self.inputs.items()):
             digest.update(
@@ -313,7 +321,9 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of what is seen behind this model's print, and its named parts; by default ``loss``."""
+        """Return the loss of what is seen behind this model's print, and its named parts; by default
+        ``loss``.
+        """
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})
 
@@ -322,7 +332,7 @@ _TASKS: dict[str, type[Task]] = {}
 
 
 def register_task(task: type[Task]) -> type[Task]:
-    """Register a task of your own, so that its designs can be opened; works as a class decorator.
+    """Register your own task, so that its designs can be opened; also works as a class decorator.
 
     Raises:
         InputError: no name, or the name of another task.
@@ -336,7 +346,7 @@ def register_task(task: type[Task]) -> type[Task]:
 
 
 def registered_task(name: str) -> type[Task]:
-    """The task of that name.
+    """Return the task of that name.
 
     Raises:
         InputError: no such task is registered.
@@ -355,5 +365,5 @@ def _source(task: type) -> str:
     try:
         return inspect.getsource(task)
     except (OSError, TypeError):
-        # Typed into an interpreter, so there is no source to compare.
+        # The class was typed into an interpreter, so there is no source to compare.
         return ""

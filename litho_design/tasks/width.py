@@ -1,4 +1,4 @@
-"""The width of a design: figures of its layout and of uncorrected layouts by every available model."""
+"""The width of a design: the figures of its layout and of uncorrected layouts by every available model."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from litho_data.foundation.results import Record
 
 SEARCHED = "searched"
-# 95 % of normal errors lie within twice their standard deviation.
+# 95 % of normal errors lie within twice the standard deviation.
 _SURE = 2.0
 
 
 class Width(Record):
-    """One entry per model: first those of the search, then the judges, which the search did not use.
+    """One entry per model: first the models of the search, then the judges, which the search did not use.
 
     Attributes:
         searched_with: how many of the models the search used.
@@ -34,13 +34,15 @@ class Width(Record):
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
-        """The figure of a candidate, by default of the returned one, by every model."""
+        """Return the figure of a candidate by every model; the default is the returned candidate."""
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
 
     @property
     def between(self) -> tuple[float, float]:
-        """Expected range of a print's figure: the range over models, widened by twice their own error."""
+        """Return the expected range of a print's figure: the range over models, widened by twice their own
+        error.
+        """
         values = self.values()
         if self.loss_unit is None:
             return float(values.min()), float(values.max())
@@ -51,19 +53,20 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Gain of the figure over the best uncorrected layout, as the median over models."""
+        """Return the gain of the figure over the best uncorrected layout, as the median over models."""
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
         return float(np.median(sign * self.values() - np.max(idle, axis=0))) if idle else None
 
     @property
     def disagreement(self) -> float:
-        """Range of the figure over the models."""
+        """Return the range of the figure over the models."""
         return float(np.ptp(self.values()))
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """The level on whose height the models disagree most, with its lowest and highest height, µm."""
+        """Return the level on whose height the models disagree most, with its lowest and highest height, µm.
+        """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]
         level = int(np.ptp(heights, axis=0).argmax())

@@ -63,8 +63,8 @@ def compare(
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
-    All arms share every setting except for the printer; finished designs in ``out`` are reused, interrupted
-    ones resumed. The arms' own printers also judge, which completes the matrix.
+    All arms share every setting except the printer. Finished designs in ``out`` are reused, and interrupted
+    designs resume. The arms' own printers also judge, which completes the matrix.
 
     Args:
         settings: settings of a hologram or a lens, which decide what is designed, or of ``task``; ``seeds``
@@ -94,7 +94,7 @@ def compare(
     others = load_printers(judges, settings.layout, **fit)
     _check(designers, others, every_seed)
     folder = Path(out)
-    # Printers are checked before a target is drawn or a picture is read.
+    # The printers are checked before a target is drawn or a picture is read.
     make: Callable[[Any, Printer], Task]
     if task is not None:
         make = partial(registered_task(task.name), inputs=inputs)
@@ -154,7 +154,7 @@ def _design(job: _Job) -> Design:
 def _judged(
     place: Path, arm: str, seed: int, printers: Mapping[str, Printer]
 ) -> tuple[list[GapEntry], list[Panel]]:
-    """A finished design as printed by every printer: entries, and pictures after the wanted one."""
+    """Print a finished design with every printer; return entries, and pictures after the wanted one."""
     loaded = load_design(place, device=printers[arm].device)
     expected = loaded.printed_um(printers[arm])
     entries, side_um = [], loaded.window_um

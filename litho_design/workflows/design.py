@@ -43,8 +43,8 @@ class How(TypedDict, total=False):
     Attributes:
         judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
             by default the zoo's models that were trained on the same prints.
-        robust: search also through those judges that have gradients: for the lowest worst loss, plus a
-            penalty on the models' disagreement.
+        robust: search also through those judges that have gradients, for the lowest worst loss plus a penalty
+            on the models' disagreement.
         device: device of the models.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting (the default).
@@ -188,12 +188,14 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """The deviation of a first element's measured print, as an input of the second; empty without a first."""
+    """Return the deviation of a first element's measured print, as an input of the second; empty without a
+    first element.
+    """
     if after is None and scan is None:
         return {}
     if after is None or scan is None:
         given = "a first element without a scan" if scan is None else "a scan without its element"
-        raise InputError("second round", got=given, wanted="both: --after and --scan")
+        raise InputError("second round", got=given, wanted="both --after and --scan")
     first = load_design(after)
     if first.record.layout != settings.layout:
         raise InputError(
@@ -213,7 +215,7 @@ def design(
     inputs: Mapping[str, np.ndarray] | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout for a task of your own (see ``Task``).
+    """Optimise the layout for your own task (see ``Task``).
 
     Args:
         task: a class registered by ``register_task``.
@@ -254,7 +256,7 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """The design of a task; printers are loaded first, to refuse bad ones before a target is read."""
+    """Make the design of a task; printers are loaded first, to refuse bad ones before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
     if judges is None:
@@ -268,7 +270,9 @@ def _designed(
 
 
 def _alone(how: How, *objects: Any) -> How:
-    """Refuse objects, judges and ``robust`` for a large element; returns the rest, without judges."""
+    """Refuse objects, judges and ``robust`` for a large element; return the remaining arguments, without
+    judges.
+    """
     if how.get("robust") or objects or how.get("judges"):
         got = "objects or judges"
         raise InputError("large element", got=got, wanted="one design through one model")

@@ -1,4 +1,4 @@
-"""A first result: one small hologram designed without and with a printer model, which prints both."""
+"""A first result: one small hologram, designed without and with a printer model; this model prints both."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
 def small_hologram() -> HologramSettings:
-    """Settings small enough for a minute on two cores, with a distance at which it can draw the letters."""
+    """Return settings small enough for a minute on two cores, with a distance at which the hologram can draw
+    the letters.
+    """
     small = {
         "layout.size_px": 256,
         "optics.distance_um": 25,

@@ -37,7 +37,7 @@ def score(
     Args:
         design: a design, as its folder or from ``load_design``.
         out: folder of the score.
-        judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Those
+        judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Judges
             with the weights of the design's own model are marked as not independent. Without judge, scan and
             photograph, the zoo's models that were trained on the same prints judge.
         scan: a measured height map of the printed part.
