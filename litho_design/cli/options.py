@@ -124,7 +124,9 @@ def takes_settings(
             }
             twice = sorted(set(options) & set(words))
             if twice:
-                raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two")
+                raise InputError(
+                    "--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two"
+                )
             unused = sorted(set(leave_out) & set(words))
             if unused:
                 raise InputError("--set", got=unused[0], wanted="a setting that this command leaves open")

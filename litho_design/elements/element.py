@@ -130,7 +130,11 @@ class Element(nn.Module):
             raise InputError("wavelength", got=f"{wavelength_um:g} µm", wanted=wanted, hint=hint)
         index, around = self._index(wavelength_um), self.surroundings
         if not index > around:
-            raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than that of its surroundings, {around:g}")
+            raise InputError(
+                "resin",
+                got=f"an index of {index:g}",
+                wanted=f"more than that of its surroundings, {around:g}",
+            )
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:

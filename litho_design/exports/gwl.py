@@ -1,4 +1,5 @@
-"""Write layouts as GWL for Nanoscribe printers: one line of resist for each run of pixels in a row and slice.
+"""Write layouts as GWL for Nanoscribe printers: one line of resist for each run of pixels in a row and
+slice.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx), row 0 on top, in memory or on disk; its rows are sliced like those of an array.
+    """A level map (ny, nx), row 0 on top, in memory or on disk; its rows are sliced like those of an
+    array.
     """
 
     @property

@@ -79,7 +79,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """Return the wave (size, size) of unit power whose image comes closest to sqrt(target) with a flat phase.
+    """Return the wave (size, size) of unit power whose image comes closest to sqrt(target) with a flat
+    phase.
     """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)

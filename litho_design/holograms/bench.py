@@ -121,7 +121,8 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Return the share of the power behind the element that belongs to its mean, the undiffracted plane wave.
+    """Return the share of the power behind the element that belongs to its mean, the undiffracted plane
+    wave.
     """
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)
@@ -133,7 +134,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM of the waves' light, as a camera records it, against the target on the camera's pixels.
+    """Return the SSIM of the waves' light, as a camera records it, against the target on the camera's
+    pixels.
     """
     import cv2
 

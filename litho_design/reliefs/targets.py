@@ -86,5 +86,9 @@ def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
             "relief", got=f"{found.shape} px", wanted=f"({size_px}, {size_px}) px, the element's"
         )
     if not np.isfinite(found).all() or np.ptp(found) == 0:
-        raise InputError("relief", got="heights that are all equal or not numbers", wanted="finite heights in µm that differ")
+        raise InputError(
+            "relief",
+            got="heights that are all equal or not numbers",
+            wanted="finite heights in µm that differ",
+        )
     return found

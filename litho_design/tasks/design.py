@@ -136,6 +136,8 @@ def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.nd
     if wanted is None or not path.exists():
         raise InputError(f"array {name}", got=f"no such file in {folder}", wanted="a complete design folder")
     if file_sha256(path) != wanted:
-        raise InputError(f"array {path}", got="a file that changed after the design", wanted=f"SHA-256 {wanted}")
+        raise InputError(
+            f"array {path}", got="a file that changed after the design", wanted=f"SHA-256 {wanted}"
+        )
     found: np.ndarray = np.load(path, mmap_mode="r" if on_disk else None, allow_pickle=False)
     return found
