@@ -89,7 +89,9 @@ class HologramTask(Task):
         return figures | self._inside_window(seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels that print the phases of ``gerchberg_saxton`` (weighted if the start is ``wgs``)."""
+        """Return the levels that print the phases of ``gerchberg_saxton`` (weighted if the start is
+        ``wgs``).
+        """
         search = self.settings.search
         phase, _ = gerchberg_saxton(
             self.bench.propagator, self.target, self.cells, iterations=_START_ITERATIONS,

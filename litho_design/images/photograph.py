@@ -123,7 +123,9 @@ class Photograph:
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
-        """Express ``image`` as shares of the light on the element, whose summed counts are ``power_counts``."""
+        """Express ``image`` as shares of the light on the element, whose summed counts are
+        ``power_counts``.
+        """
         # Pixels of the photograph per pixel in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts

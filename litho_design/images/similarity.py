@@ -23,7 +23,9 @@ def si_psnr_db(image: Tensor, target: Tensor) -> float:
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted light."""
+    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted
+    light.
+    """
     average = (image * target).sum() / target.sum()
     return (image / average - target).square().mean().sqrt()
 

@@ -235,7 +235,9 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan: a map (ny, nx), µm, of zero mean, its slopes (x, y), and the range of the bow."""
+    """Tilt and bow of a scan: a map (ny, nx), µm, of zero mean, its slopes (x, y), and the range of the
+    bow.
+    """
 
     map_um: np.ndarray
     tilt_um_per_um: tuple[float, float]

@@ -66,7 +66,9 @@ class LensPhotoScore(Record):
 
 @dataclass(frozen=True)
 class PhotoVerdict:
-    """The figures of a photograph with their uncertainties, the photograph's record, and pictures by title."""
+    """The figures of a photograph with their uncertainties, the photograph's record, and pictures by
+    title.
+    """
 
     figures: Record
     uncertainty: dict[str, float]

@@ -1,4 +1,6 @@
-"""Score a design as models print it, as measured or as photographed; the layout is always the printable one."""
+"""Score a design as models print it, as measured or as photographed; the layout is always the printable
+one.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Return remarks on how a measurement was processed and what is uncertain about it, one phrase each."""
+        """Return remarks on how a measurement was processed and what is uncertain about it, one phrase
+        each.
+        """
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 

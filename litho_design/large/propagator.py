@@ -136,7 +136,9 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space; small elements need a period longer than their side."""
+        """Compute the transfer function of free space; small elements need a period longer than their
+        side.
+        """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]
         rows, columns = spectrum_axes(*given)

@@ -76,7 +76,9 @@ def _ratio(pitches: float) -> tuple[int, int] | None:
 
 
 def rs_kernel(y_um: Tensor, x_um: Tensor, distance_um: float, wavelength_um: float) -> Tensor:
-    """Return h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128, at broadcast separations."""
+    """Return h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128, at broadcast
+    separations.
+    """
     wavenumber = 2 * math.pi / wavelength_um
     squared = y_um.double() ** 2 + x_um.double() ** 2 + distance_um**2
     radius = squared.sqrt()

@@ -16,7 +16,9 @@ _DECAY_LENGTHS = 2.0
 def centred_grid(
     shape: tuple[int, int], pitch_um: float, centre_um: tuple[float, float] = (0.0, 0.0)
 ) -> PixelGrid:
-    """Make a grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes alike."""
+    """Make a grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes
+    alike.
+    """
     grid = PixelGrid.square(shape, pitch_um)
     height, width = grid.size_um
     return replace(grid, origin_um=(centre_um[0] - height / 2, centre_um[1] - width / 2))

@@ -9,7 +9,9 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels, seen as one period of a blaze; None for figures that need a full wave."""
+    """Printed heights of the levels, seen as one period of a blaze; None for figures that need a full
+    wave.
+    """
 
     printed_height_um: list[float]
     stroke_um: float

@@ -25,7 +25,9 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """State the estimate in one line: for the iterations left after ``done``, and for scores and report."""
+        """State the estimate in one line: for the iterations left after ``done``, and for scores and
+        report.
+        """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
         minutes = (searched + left / search.evaluate_every * self.seconds_per_evaluation + seconds_after) / 60

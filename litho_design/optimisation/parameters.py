@@ -1,4 +1,6 @@
-"""Free parameters and the layout that they describe: cells or rings, with Gumbel-Softmax or rounded heights."""
+"""Free parameters and the layout that they describe: cells or rings, with Gumbel-Softmax or rounded
+heights.
+"""
 
 from __future__ import annotations
 

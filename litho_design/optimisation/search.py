@@ -1,4 +1,6 @@
-"""The search loop of every task: it turns free parameters into printable levels and resumes from checkpoints."""
+"""The search loop of every task: it turns free parameters into printable levels and resumes from
+checkpoints.
+"""
 
 from __future__ import annotations
 

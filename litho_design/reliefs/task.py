@@ -32,7 +32,9 @@ _AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
-    """Errors of a print's height after its mean is removed, because the zero of a print depends on its base."""
+    """Errors of a print's height after its mean is removed, because the zero of a print depends on its
+    base.
+    """
 
     rms_nm: float = Field(description="rms error of the print, offset free, nm")
     mae_nm: float = Field(description="mean absolute error, offset free, nm")
@@ -102,7 +104,9 @@ class ReliefTask(Task):
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the expected rms error, µm, from the error of the model's print and the model's own error."""
+        """Return the expected rms error, µm, from the error of the model's print and the model's own
+        error.
+        """
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
@@ -144,7 +148,9 @@ class ReliefTask(Task):
 
     @property
     def _nominal(self) -> Tensor:
-        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted to 0."""
+        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted
+        to 0.
+        """
         return self._affine(
             1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
         )

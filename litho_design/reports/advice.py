@@ -160,7 +160,9 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """Return the summary of a score that a command prints at its end, with the uncertainty of a measurement."""
+    """Return the summary of a score that a command prints at its end, with the uncertainty of a
+    measurement.
+    """
     sd = uncertainty or {}
 
     def told(name: str, digits: int, scale: int = 1) -> str:

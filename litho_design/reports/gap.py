@@ -24,7 +24,9 @@ _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
 def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequence[Panel]]) -> Path:
-    """Write ``report.html`` and one CSV per table; ``pictures`` shows the first seed, with one row per arm."""
+    """Write ``report.html`` and one CSV per table; ``pictures`` shows the first seed, with one row per
+    arm.
+    """
     lens = result.task.startswith("lens-")
     what = result.task.replace("lens-", "lens, ").replace("-", " ")
     what = f"hologram of “{result.target}”" if result.task == "hoe" else what

@@ -23,7 +23,9 @@ _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map (m, m), ``side_um`` wide, in a colour map of matplotlib; if it has a unit, it has a colour bar."""
+    """A map (m, m), ``side_um`` wide, in a colour map of matplotlib; if it has a unit, it has a colour
+    bar.
+    """
 
     title: str
     values: np.ndarray

@@ -24,7 +24,9 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """The sheet for a lab; ``expected_db`` is the SI-PSNR of each hologram's image that ``model`` predicts."""
+    """The sheet for a lab; ``expected_db`` is the SI-PSNR of each hologram's image that ``model``
+    predicts.
+    """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet/1"
     FILE_NAME: ClassVar[str] = "sheet.json"

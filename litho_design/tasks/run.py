@@ -200,7 +200,9 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate the time of choice, scores and yield, from one print by each model and one draw of the yield."""
+    """Estimate the time of choice, scores and yield, from one print by each model and one draw of the
+    yield.
+    """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()
     heights = [task.printed_um(level, one) for one in models]

@@ -110,7 +110,9 @@ class Task:
     # Methods that your own task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """Return the optics of every image: colours (``optics.at_wavelength``), planes, angles of incidence."""
+        """Return the optics of every image: colours (``optics.at_wavelength``), planes, angles of
+        incidence.
+        """
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
@@ -174,12 +176,16 @@ class Task:
         return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score a print (size, size), µm, whose design expected ``expected_um``, by default the print itself."""
+        """Score a print (size, size), µm, whose design expected ``expected_um``, by default the print
+        itself.
+        """
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score a print as a thick element; return None if the settings already say thick, or without light."""
+        """Score a print as a thick element; return None if the settings already say thick, or without
+        light.
+        """
         if self.settings.optics.element == "thick":
             return None
         optics = self.settings.optics.model_copy(update={"element": "thick"})
@@ -228,7 +234,9 @@ class Task:
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Draw what is seen for reports: images divided by their brightest value, side by side in a square."""
+        """Draw what is seen for reports: images divided by their brightest value, side by side in a
+        square.
+        """
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
         tiles = np.zeros((side * side, *images.shape[1:]))

@@ -65,7 +65,9 @@ class Width(Record):
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """Return the level on whose height the models disagree most, with its lowest and highest height, µm."""
+        """Return the level on whose height the models disagree most, with its lowest and highest height,
+        µm.
+        """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]
         level = int(np.ptp(heights, axis=0).argmax())
