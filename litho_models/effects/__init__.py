@@ -1,4 +1,4 @@
-"""The catalogue of effects: named, differentiable, off at their null value."""
+"""The catalogue of effects: named, differentiable changes that do nothing at their null value."""
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, of_single_scans
 from litho_models.effects.registry import (

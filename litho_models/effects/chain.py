@@ -1,4 +1,4 @@
-"""A base model with effects, and the part of it that designs may use."""
+"""Apply effects before and after a base model, and select the part of this chain that designs may use."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Frame = Literal["scan", "print"]
 
 
 class EffectChain(nn.Module):
-    """Layout effects, the base model, then height effects, in the order of the catalogue.
+    """Apply layout effects, then the base model, then height effects, in the order of the catalogue.
 
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
         effects: effect name to parameter values; unnamed parameters are off.
-        frames: what a height effect turns with, if it differs from the default: effects of stage
-            ``measurement`` turn with the scan, all others with the print.
+        frames: whether a height effect turns with the print or with the scan, if that differs from the
+            default: effects of stage ``measurement`` turn with the scan, all others with the print.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class EffectChain(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of the base model. Effects act on the whole field."""
+        """Return the tile of the base model; effects act on the whole field."""
         return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
-        """Height (b, 1, y, x), µm. Without a context the field is one write field."""
+        """Return the height (b, 1, y, x), µm. Without a context the field is one write field."""
         if context is None:
             assert isinstance(self.base, Simulator)
             geometry = self.base.config
@@ -54,11 +54,11 @@ class EffectChain(nn.Module):
         return self.after_base(self.base(self.before_base(layout_um, context)), context)
 
     def before_base(self, layout_um: Tensor, context: FieldContext) -> Tensor:
-        """The layout after the effects that act before the base model."""
+        """Apply the effects that act before the base model to the layout."""
         return self._run_stage("layout", layout_um, context)
 
     def after_base(self, height_um: Tensor, context: FieldContext) -> Tensor:
-        """The base model's height after the height effects."""
+        """Apply the height effects to the base model's height."""
         return self._run_stage("height", height_um, context)
 
     def _run_stage(self, acts_on: ActsOn, field: Tensor, context: FieldContext) -> Tensor:

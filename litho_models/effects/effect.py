@@ -1,4 +1,4 @@
-"""Define an effect: a differentiable change of the layout or the height that vanishes at its null."""
+"""Define an effect: a differentiable change of the layout or the height that vanishes at its null value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
-# What a found effect tells: the cause, a formula, or only a dependence.
+# Kinds of knowledge that a found effect provides: the cause, a formula, or only a dependence.
 Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
@@ -37,7 +37,7 @@ class Parameter:
         kind: an ``amplitude`` switches the effect off at ``null``; a ``shape`` (a length, a position) has no
             meaning while the amplitudes are null; a ``choice`` is a shape with few values (a direction),
             never fitted.
-        null: value of an amplitude at which the effect is the identity.
+        null: value of an amplitude at which the effect changes nothing.
         tried: values for screening; ``typical`` if empty.
     """
 
@@ -51,13 +51,13 @@ class Parameter:
 
     @property
     def off(self) -> float:
-        """The value this parameter has while its effect is off."""
+        """Return the value this parameter has while its effect is off."""
         return self.null if self.kind == "amplitude" else self.typical
 
 
 @dataclass(frozen=True)
 class FieldContext:
-    """What an effect may know about a field, besides the array that it acts on.
+    """What an effect may know about a field in addition to the array that it changes.
 
     Args:
         layout_um: exposure, as nominal height times relative dose (1, 1, y, x), µm.
@@ -101,7 +101,7 @@ class FieldContext:
         return self._kept[name]
 
     def in_scan_frame(self) -> FieldContext:
-        """The field in the frame of the scan, with the fast axis along x."""
+        """Turn the field into the frame of the scan, with the fast axis along x."""
         if not self.quarter_turns % 4:
             return self
         (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
@@ -117,29 +117,31 @@ class FieldContext:
         )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
-        """(y, x) of each pixel from the centre of the write field: shapes (y, 1) and (1, x), µm."""
+        """Return each pixel's (y, x) from the centre of the write field: shapes (y, 1) and (1, x), µm."""
         rows, columns = self._pixels()
         (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
         return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
 
     def whole_shape(self) -> tuple[int, int]:
-        """(rows, columns) of the whole scan."""
+        """Return (rows, columns) of the whole scan."""
         return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
-        """(y, x) of each pixel from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
+        """Return each pixel's (y, x), from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
         rows, columns = self._pixels()
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
         return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
 
     def _pixels(self) -> tuple[Tensor, Tensor]:
-        """Row and column of each pixel, shapes (y, 1) and (1, x)."""
+        """Return the row and column of each pixel, shapes (y, 1) and (1, x)."""
         layout = self.layout_um
         y, x = (torch.arange(n, dtype=layout.dtype, device=layout.device) for n in layout.shape[-2:])
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
-        """Half the write field, or half the longer side of this field if the card states no write field."""
+        """Return half the write field, or half the longer side of this field if the card states no write
+        field.
+        """
         if self.field_radius_um is not None:
             return self.field_radius_um
         return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
@@ -149,9 +151,11 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Placeholder formula of a per-scan effect, whose scan terms are fitted to each scan."""
+    """Stand in for the formula of a per-scan effect, whose terms are fitted to each scan separately."""
     raise InputError(
-        "an effect in a model", got="one with a value for each scan", wanted="one with a value for all scans"
+        "an effect in a model",
+        got="a per-scan effect",
+        wanted="an effect with the same parameters in all scans",
     )
 
 
@@ -170,12 +174,12 @@ class Effect:
         trials: parameter sets at which screening takes secants; by default one amplitude at a time, at each
             of its ``tried`` values, in each shape.
         source: source of the formula.
-        separating: experiment that separates it from similar effects.
-        needs: facts about the print that its test requires.
+        separating: experiment that separates this effect from similar effects.
+        needs: facts about the print that a test of this effect requires.
         reverses: parameters with the opposite sign on retrace lines.
-        of_tip: whether a new tip removes it.
-        of_films: whether it moves the edges of a film seen from above; other effects change heights.
-        knowledge: a cause has a name, a law only a formula, a description only a covariate.
+        of_tip: whether a new tip removes this effect.
+        of_films: whether this effect moves the edges of a film seen from above; other effects change heights.
+        knowledge: a cause has a name, a law only a formula, and a description only a covariate.
     """
 
     name: str
@@ -205,7 +209,7 @@ class Effect:
 
     @property
     def per_scan(self) -> bool:
-        """Whether every scan has its own parameters."""
+        """Return whether every scan has its own parameters."""
         return self.apply is of_single_scans
 
     def _trials(self) -> Iterator[dict[str, float]]:
@@ -217,11 +221,11 @@ class Effect:
                     yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
-        """Parameters at which the effect is the identity."""
+        """Return parameters at which the effect changes nothing."""
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Parameters at their off values, with some replaced.
+        """Return the off values, with some of them replaced.
 
         Raises:
             InputError: a name this effect does not have.
@@ -281,7 +285,7 @@ def entry(
     acts_on: ActsOn,
     **facts: Any,
 ) -> Callable[[Apply], Effect]:
-    """Make a decorator that turns a formula into an effect of the same name; ``facts``: other fields of
+    """Make a decorator that turns a formula into an effect of the same name; ``facts`` are other fields of
     ``Effect``.
     """
 
@@ -292,7 +296,7 @@ def entry(
     return of_formula
 
 
-# Usual stages and roles of effects.
+# Decorators for the usual stages and roles of effects.
 of_exposure = partial(entry, stage="exposure", role="process", acts_on="layout")
 of_resist = partial(entry, stage="resist", role="process", acts_on="height")
 of_development = partial(entry, stage="development", role="process", acts_on="height")

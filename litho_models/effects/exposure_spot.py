@@ -1,4 +1,4 @@
-"""Exposure: shape and background of the writing spot, and separately cured slices."""
+"""Effects of the exposure: shape and background of the writing spot, and separately cured slices."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
-# Up to this difference of variances the spot is sharpened along one axis as much as it is widened along the
-# other. Above it the spot is only widened, to limit amplification.
+# Up to this difference of variances, the spot is sharpened along one axis as much as it is widened along the
+# other. Above this difference the spot is only widened, to limit amplification.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
 
@@ -30,7 +30,9 @@ _SLICED_REACH_UM = 0.8
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """T = exp(-2 π² f' C f), C the change of the spot's second moments with (Cxx - Cyy, 2 Cxy) given."""
+    """Make the spot elliptical: T = exp(-2 π² f' C f), where C changes the spot's second moments by the given
+    Cxx - Cyy and 2 Cxy.
+    """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
 
@@ -51,7 +53,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = (M + η G_b * M) / (1 + η): the dose of the neighbourhood within b leaks in."""
+    """Add the dose of the neighbourhood within b: D = (M + η G_b * M) / (1 + η)."""
     weight, length = values["weight"], values["length_um"]
     blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -64,7 +66,9 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = M_ref (M / M_ref)^p, with a foot of 1 % so that the slope at M = 0 stays finite."""
+    """Raise the dose to a power: D = M_ref (M / M_ref)^p, with a foot of 1 % so that the slope at M = 0 stays
+    finite.
+    """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
     relative = torch.clamp(layout / full, min=0) + foot
@@ -84,7 +88,7 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     separating="pillars and pits of one width and several heights, one slice and many",
 )
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """(1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M: slices of height t cure separately.
+    """Cure slices of height t separately: (1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M.
 
     The step is logistic about the threshold and maps 0 to 0 and 1 to 1. A slice narrower than the spot is
     lost, and a gap narrower than the spot is filled.
@@ -95,7 +99,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _exposed_slices(context: FieldContext) -> Tensor:
-    """Exposure (slices, 1, y, x) of each slice by the spot; 1: fully exposed."""
+    """Return the exposure (slices, 1, y, x) of each slice by the spot; 1 means fully exposed."""
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
     # The dose changes the exposure, not the number of slices.

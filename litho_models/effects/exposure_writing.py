@@ -1,4 +1,4 @@
-"""Exposure: effects of position and order in the write field, and of the writing motion."""
+"""Effects of the exposure: position and order in the write field, and the writing motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# Longest ripple; slower waves look like maps of the field.
+# Frequency of the longest ripple; slower waves look like maps of the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
@@ -30,7 +30,7 @@ _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
     separating="print one layout at the centre and at the edge of the write field",
 )
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = M (1 - v r² / R²): less light towards the edge of the write field."""
+    """Reduce the light towards the edge of the write field: D = M (1 - v r² / R²)."""
     y, x = context.centred_um()
     return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
 
@@ -43,7 +43,9 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + 1[M > 0] (a x + b y + c r²), coordinates in units of R: focus and stage tilt over the field."""
+    """Change the height by focus and stage tilt over the field: H + 1[M > 0] (a x + b y + c r²), coordinates
+    in units of R.
+    """
     y, x = context.centred_um()
     radius = context.radius_um()
     tilt = values["tilt_x_um"] * x / radius + values["tilt_y_um"] * y / radius
@@ -60,7 +62,9 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("order",),
 )
 def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = M (1 + ρ t), t the position in the writing order from -0.5 to 0.5."""
+    """Let the dose drift while fields are written: D = M (1 + ρ t), with t the position in the writing order,
+    -0.5 to 0.5.
+    """
     return layout * (1 + values["drift"] * context.order)
 
 
@@ -77,9 +81,10 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     separating="leave bare substrate in every field",
 )
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max(H - z, H_s) where H > H_s, the substrate: the part written below the substrate is lost.
+    """Remove the part written below the substrate H_s: max(H - z, H_s) where H > H_s.
 
-    The lost part shrinks like the rest, z = z0 (1 - k (1 - u)), u the relative nominal height nearby.
+    The lost part shrinks like the rest: z = z0 (1 - k (1 - u)), where u is the relative nominal height
+    nearby.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -97,7 +102,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The beam lags: one-sided exponential of length l = v τ, without its mean delay."""
+    """Let the beam lag: a one-sided exponential of length l = v τ, without its mean delay."""
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -115,9 +120,10 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
 )
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line is shorter by δ at both ends, or longer.
+    """Shorten every written line by δ at both ends (or lengthen it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula is right for the lost area of an edge. The spot, which is wider than δ, determines its shape.
+    The formula gives the area that an edge loses correctly. The shape of the edge depends on the spot, which
+    is wider than δ.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -130,9 +136,10 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
     separating="scan each print at 0 and 90 degrees; scan a calibration grating",
 )
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """M(x + c (r² / 3 - x²) / 2R) along the written lines, x from the centre of a field of half width r.
+    """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), x from the centre of a field of half width r.
 
-    That is c x (1 - x / 2R) over the write field of half width R, without the part that registration removes.
+    Over the write field of half width R this is c x (1 - x / 2R), without the part that registration
+    removes.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -155,7 +162,9 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     separating="print the same layout with the writing order reversed",
 )
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: earlier lines deplete the resist."""
+    """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0), with K_l one-sided along the slow
+    axis.
+    """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -182,10 +191,10 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     separating="rescan at 25 nm per pixel",
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
+    """Add ripples at the hatching pitch p, seen as their alias: H + 1[M > 0] (a cos 2π f y + b sin 2π f y).
 
-    Sampled at the pixel dx, they appear at f = |1/p - 1/dx|. The write field fixes their phase, which is the
-    same in every print.
+    Sampled with pixels dx, the ripples appear at f = |1/p - 1/dx|. The write field fixes the phase of the
+    ripples, which is the same in every print.
     """
     y, x = context.centred_um()
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)

@@ -1,4 +1,4 @@
-"""Films: effects that move the edges of a written, developed or etched film, seen from above.
+"""Effects on films: they move the edges of a written, developed or etched film, seen from above.
 
 Lengths are in pixels of the layout, which resolve the beam or lens of the machine.
 """
@@ -15,7 +15,8 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp, gradient
 from litho_models.models.parts import FLATTEST, etch
 
-# Blurs of a film that define the normals of its edges and the position of a sharp rim; range of a diffusion.
+# Blurs of a film that define the normals of its edges and the position of a sharp rim, and the range of a
+# diffusion.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
 
 _of_films = partial(entry, role="process", of_films=True)
@@ -33,7 +34,7 @@ _of_films = partial(entry, role="process", of_films=True)
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = (M + η G_b * M) / (1 + η): part of the dose within b returns from the substrate."""
+    """Return part of the dose from the substrate to the film within b: D = (M + η G_b * M) / (1 + η)."""
     weight, length = values["weight"], values["length_px"]
     blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -48,7 +49,7 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     separating="write necks and islands of five widths, bake for two times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The film blurred by a Gaussian of variance s², with its edge where the blurred film is one half."""
+    """Blur the film by a Gaussian of variance s², and place its edge where the blurred film is one half."""
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     separating="write one layout at five doses: a bias is the same at each",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H taken at the distance of the bias inwards, so edges move outwards by the bias along their normals."""
+    """Move edges outwards by the bias along their normals: the film is evaluated at this distance inwards."""
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)

@@ -1,4 +1,4 @@
-"""Linear filters, gradients and warps for effects; at zero strength each changes nothing, to the bit."""
+"""Linear filters, gradients and warps for effects; at zero strength each returns its input bit for bit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext
 
-# Slope below which its powers are smoothed.
+# Slopes below this are smoothed before a power is taken.
 _LEAST_SLOPE = 1e-3
 
 
@@ -22,7 +22,7 @@ def add_filtered(
     pitch_um: float,
     reach_um: float,
 ) -> Tensor:
-    """Field plus the field filtered with (T - 1), so that T = 1 gives the field bit for bit.
+    """Add to the field the field filtered with (T - 1), so that T = 1 returns the field bit for bit.
 
     Args:
         field: (b, 1, y, x).
@@ -43,7 +43,7 @@ def add_filtered(
 
 
 def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float) -> Tensor:
-    """Isotropic Gaussian blur of the given variance, µm²: T = exp(-2 π² s² f²)."""
+    """Blur isotropically with a Gaussian of the given variance, µm²: T = exp(-2 π² s² f²)."""
     return add_filtered(
         field,
         lambda fy, fx: torch.expm1(-2 * math.pi**2 * variance_um2 * (fy * fy + fx * fx)),
@@ -53,28 +53,29 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
 
 
 def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
-    """Mean relative nominal height within that length of each pixel (1, 1, y, x)."""
+    """Return the mean relative nominal height within that length of each pixel (1, 1, y, x)."""
     relative = context.layout_um / context.full_height_um
     return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Transfer of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential tail of length l.
+    """Return the transfer function of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential
+    tail of length l.
 
-    Analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
+    It is analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
     """
     difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
     return 1 / (1 + length_um / pitch_um * difference)
 
 
 def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """``trailing_response`` without its mean delay l, because registration removes a mean shift."""
+    """Return ``trailing_response`` without its mean delay l, because registration removes a mean shift."""
     advance = torch.exp(2j * math.pi * frequency * length_um)
     return trailing_response(frequency, length_um, pitch_um) * advance
 
 
 def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
-    """Central differences (d/dy, d/dx) with replicated edges, per µm."""
+    """Return the central differences (d/dy, d/dx) with replicated edges, per µm."""
     padded = functional.pad(field, (1, 1, 1, 1), mode="replicate")
     along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * pitch_um)
     along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * pitch_um)
@@ -82,12 +83,13 @@ def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 
 def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
-    """A power of the absolute slope, smoothed near zero to be differentiable."""
+    """Return a power of the absolute slope, smoothed near zero to be differentiable."""
     return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
 
 
 def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
-    """Field at (y + shift_y, x + shift_x) by cubic interpolation; a zero shift returns the field bit for bit.
+    """Sample the field at (y + shift_y, x + shift_x) by cubic interpolation; a zero shift returns the field
+    bit for bit.
 
     Args:
         field: (1, 1, y, x).
@@ -102,7 +104,7 @@ def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: fl
 
 def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:
     ny, nx = field.shape[-2:]
-    # From -1 to 1 over the field.
+    # Coordinates run from -1 to 1 over the field.
     x, y = torch.broadcast_tensors(2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1)
     grid = torch.stack([x, y], dim=-1).expand(len(field), ny, nx, 2)
     return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)

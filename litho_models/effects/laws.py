@@ -1,8 +1,8 @@
 """Laws: short formulas of height, slopes, surroundings, position and order.
 
 A law is an effect with one strength (and the position of a jump), so the same code screens, fits, judges and
-applies it. It states how the height departs from the model, not why. Tables have many strengths; they follow
-any dependence on their covariate and explain nothing.
+applies laws. A law states how the height departs from the model, not why. Tables have many strengths. They
+follow any dependence on their covariate and explain nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from litho_models.effects.filters import add_blur, add_filtered, gradient, round
 
 _REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _RIM_UM = 2.0
-# Over a micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
+# Over one micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
 _FREQUENCIES_PER_UM = tuple(0.5 * half for half in range(4, 21))
 _WORDS = ("x", "y", "r²", "rim")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
@@ -47,25 +47,27 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Surface:
-    """Quantities for formulas, from a height h (b, 1, y, x), µm, its field, and the law's parameters."""
+    """Compute the quantities in formulas from a height h (b, 1, y, x), µm, its field, and the law's
+    parameters.
+    """
 
     h: Tensor
     context: FieldContext
     values: Values
 
     def slope(self, direction: str, of: Tensor | None = None) -> Tensor:
-        """Slope of a map (by default the height) along a direction, by central differences."""
+        """Return the slope of a map (by default the height) along a direction, by central differences."""
         along_y, along_x = _DIRECTIONS[direction]
         y, x = gradient(self.h if of is None else of, self.context.pitch_um)
         return along_y * y + along_x * x
 
     def size(self, power: float, *directions: str) -> Tensor:
-        """A power of the absolute slope along a direction, or of the steepness, smoothed near zero."""
+        """Return a power of the absolute slope along a direction, or of the steepness, smoothed near zero."""
         squared = torch.stack([self.slope(one) for one in directions]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """x, y, r² or the closeness to the scan's edge, e^(-distance / 2 µm), of each pixel."""
+        """Return for each pixel x, y, r² or the closeness to the scan's edge, e^(-distance / 2 µm)."""
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
@@ -74,7 +76,7 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """A step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
+        """Return a step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
         pixel.
         """
         number = "yx".index(axis)
@@ -82,12 +84,12 @@ class Surface:
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
     def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
-        """Gaussian-weighted local mean of a map, by default the height."""
+        """Return the Gaussian-weighted local mean of a map, by default the height."""
         field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
         return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
 
     def beside(self, side: str, length_um: float) -> Tensor:
-        """Exponentially weighted mean height on one side, with the given decay length."""
+        """Return the exponentially weighted mean height on one side, with the given decay length."""
         axis, sign = _SIDES[side]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
@@ -97,7 +99,7 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
     def along(self, direction: str, length_um: float) -> Tensor:
-        """Exponentially weighted mean height along a direction, to both sides."""
+        """Return the exponentially weighted mean height along a direction, to both sides."""
         along_y, along_x = _DIRECTIONS[direction]
         length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
 
@@ -108,11 +110,11 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
 
 
-# Computes the map (b, 1, y, x) that a strength multiplies.
+# A function that computes the map (b, 1, y, x) that a strength multiplies.
 Column = Callable[[Surface], Tensor]
 
 
-# Name, formula, unit of the column, column.
+# The name, the formula, the unit of the column, and the column.
 Facts = tuple[str, str, str, Column]
 
 
@@ -234,7 +236,7 @@ def _law(name: str, formula: str, unit: str, column: Column, **shapes: Parameter
     knowledge="law",
 )
 def height_wave(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """As slices or standing waves leave it."""
+    """Return a wave in the height, as slices or standing waves leave it."""
     phase = 2 * math.pi * values["frequency_per_um"] * height
     return height + values["sine_um"] * phase.sin() + values["cosine_um"] * phase.cos()
 
@@ -252,7 +254,7 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """One correction for each of seventeen heights of the layout, linear between them."""
+    """Return a correction for each of seventeen heights of the layout, linear between these heights."""
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
     share = (smooth / context.full_height_um * _LAST_KNOT).clamp(0, _LAST_KNOT)
@@ -263,9 +265,7 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A weight for the height difference to each displaced position; the field is continued beyond its
-    edge.
-    """
+    """Weight the height difference to each displaced position; the field is continued beyond its edge."""
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
@@ -278,7 +278,7 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
 
 @_table("a gain that depends on the position in the scan", _POWERS, "1")
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The height times a polynomial of the position in the scan."""
+    """Return the height times a polynomial of the position in the scan."""
     y, x = context.scan_position()
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 

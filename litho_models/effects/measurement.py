@@ -1,4 +1,4 @@
-"""Measurement: effects of tip, feedback and lateral scanner."""
+"""Effects of the measurement: tip, feedback and lateral scanner."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
 from litho_models.effects.filters import add_blur, add_warp
 
-# Cubic interpolation half-way between four neighbours.
+# Weights of cubic interpolation half-way between four neighbours.
 _MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
 _SHARPEST_UM = 1e-3
 # Relative radius along the sharper axis of an asymmetric tip.
@@ -31,11 +31,11 @@ _BLUR_REACH_UM = 4.0
     reverses=("direction",),
 )
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The probe lags along the fast axis, mean delay removed: z += (H - z) / (1 + l / dx).
+    """Let the probe lag along the fast axis: z += (H - z) / (1 + l / dx), without the mean delay.
 
     The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
-    At 1 the probe is a linear filter; below 1 it parachutes off falling edges. The delay is a time, so the
-    length is shorter with smaller pixels.
+    If ``rising`` is 1 the probe is a linear filter; below 1 it parachutes off falling edges. The delay is a
+    time, so the length is shorter with smaller pixels.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -59,9 +59,10 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     reverses=("strength",),
 )
 def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: the scanner runs fast in the middle of a line.
+    """Let the scanner run fast in the middle of a line: H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the
+    scan.
 
-    That is c x (1 - x / L) without its mean, because registration removes a mean shift.
+    The displacement is c x (1 - x / L) without its mean, because registration removes a mean shift.
     """
     y, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -75,9 +76,9 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     separating="register with two interpolation kernels; scan with half the pixel size",
 )
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A Gaussian blur of the finished scan, by interpolation or by the microscope's low-pass filter.
+    """Blur the finished scan with a Gaussian, as interpolation or the microscope's low-pass filter does.
 
-    Its width is a number of pixels, so smaller pixels blur less.
+    The width of the blur is a number of pixels, so smaller pixels blur less.
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
@@ -101,7 +102,8 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     of_tip=True,
 )
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max over u of H(x - u) - u² / 2R, the path of a paraboloid tip; to first order H + R |grad H|² / 2.
+    """Dilate the surface by a paraboloid tip: max over u of H(x - u) - u² / 2R; to first order H + R |grad
+    H|² / 2.
 
     A tip may be sharper along or across the scan lines; ``along`` and ``across`` are shares of R.
     """
@@ -123,14 +125,14 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)
-    # Pieces to the right of each pixel, then of each middle.
+    # Slopes of the pieces to the right of each pixel, then to the right of each middle.
     slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
     steepest = max(float(s.detach().abs().max()) for s in slopes)
     reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
     rises = [_continued(part, reach_px, "constant") for part in slopes]
-    # The gradient of a maximum is that of the touched piece, so the search needs no gradient, which would
-    # keep all pieces in memory.
+    # The gradient of a maximum is that of the touched piece. The search needs no gradient, which would keep
+    # all pieces in memory.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
         touches = [radius_um * slope for slope in rises]
@@ -153,7 +155,9 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
 
 
 def _middles(rows: Tensor) -> Tensor:
-    """Values (..., x) half a pixel to the right of each pixel, by a cubic through four neighbours."""
+    """Interpolate values (..., x) half a pixel to the right of each pixel, by a cubic through four
+    neighbours.
+    """
     padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
     middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)
     return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)

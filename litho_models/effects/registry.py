@@ -83,14 +83,14 @@ EFFECTS = (
 )
 
 
-# In the catalogue, but invisible in a residual map on the layout's grid.
+# Effects of the catalogue that leave no trace in a residual map on the layout's grid.
 UNTESTABLE = {
     "min-to-zero-datum": "an order statistic per scan; datum-offset contains its effect",
     "quantisation": "the raw files are not in the store",
     "scars-and-spikes": "a mask, not a term; the loop looks for it among the outliers",
 }
 
-# Per-scan effects act in no model.
+# Per-scan effects are missing here, because they act in no model.
 _FORWARD_ORDER = (
     *EFFECTS,
     exposure_spot.layer_stacking,
@@ -152,7 +152,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
 
 
 def get_effect(name: str) -> Effect:
-    """The effect of that name.
+    """Return the effect of that name.
 
     Raises:
         InputError: no such effect.
@@ -164,7 +164,7 @@ def get_effect(name: str) -> Effect:
 
 
 def in_forward_order(names: Sequence[str]) -> list[str]:
-    """The names sorted as the effects act, from exposure to microscope.
+    """Sort names in the order in which the effects act, from exposure to microscope.
 
     Raises:
         InputError: an unknown name.
@@ -177,7 +177,7 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Effects with parameters common to all scans, which screening tests.
+    """Return the effects that screening tests: those with parameters common to all scans.
 
     Args:
         tip_radius_um: radius of the tip or its upper bound, if the store has one, as a further trial size.

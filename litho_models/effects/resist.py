@@ -1,4 +1,4 @@
-"""Resist: conversion of dose to height, shrinkage, and gains and losses in development."""
+"""Effects of the resist: conversion of dose to height, shrinkage, and gains and losses in development."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OF_NARROW = {
     separating="step edges of two heights, scanned with two pixel sizes and a new tip",
 )
 def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H blurred by an isotropic Gaussian of variance s²: reactants diffuse after the exposure."""
+    """Blur H by an isotropic Gaussian of variance s², as reactants that diffuse after the exposure do."""
     return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
 
@@ -39,10 +39,11 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Normalised tanh projection about η: the identity for α² -> 0, a step for α² -> inf.
+    """Apply the normalised tanh projection about η: it changes nothing for α² -> 0 and is a step for α² ->
+    inf.
 
-    With x = H / full height it is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This equals the usual
-    quotient of sums of tanh and is even and analytic in α.
+    With x = H / full height the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
+    equals the usual quotient of sums of tanh and is even and analytic in α.
     """
     full, centre = context.full_height_um, values["centre"]
     relative = height / full
@@ -63,7 +64,7 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H / (1 + q |H|): tall structures grow less than in proportion to the dose."""
+    """Limit the height, because tall structures grow less than in proportion to the dose: H / (1 + q |H|)."""
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
@@ -74,7 +75,7 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
     separating="a step standard for the microscope, then a printed staircase",
 )
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """(1 - k) H: the whole print loses height."""
+    """Shrink the whole print: (1 - k) H."""
     return (1 - values["fraction"]) * height
 
 
@@ -88,7 +89,9 @@ def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) ->
     separating="print the same height inside low and high surroundings; a power sweep",
 )
 def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H (1 - k (1 - u)), u the relative nominal height nearby: thin surroundings shrink more."""
+    """Shrink more where the surroundings are thin: H (1 - k (1 - u)), u the relative nominal height
+    nearby.
+    """
     return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
 
 
@@ -99,7 +102,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(r + s H(r) / full r), r from the centre of the field: tops shrink inwards more than bases.
+    """Shrink tops inwards more than bases: H(r + s H(r) / full r), r from the centre of the field.
 
     The mean height causes a magnification, which registration removes: a scan shows at x what lies at r = x /
     (1 + s mean / full).
@@ -122,7 +125,9 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - φ (H - open_w(H)): features narrower than w lose a share of their height above the surroundings."""
+    """Let features narrower than w lose a share of their height above the surroundings: H - φ (H -
+    open_w(H)).
+    """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
 
@@ -133,14 +138,14 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     separating="trenches of five widths, developed for two times",
 )
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + ρ (close_w(H) - H): resist stays in pits narrower than w; tops are unchanged."""
+    """Leave resist in pits narrower than w: H + ρ (close_w(H) - H); tops are unchanged."""
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Closing by a square: pits narrower than the square are filled.
+    """Close by a square: pits narrower than the square are filled.
 
-    Squares are an odd number of pixels wide; other widths are interpolated.
+    Squares are an odd number of pixels wide; results for other widths are interpolated.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -149,13 +154,15 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:
-    """Closing by a square of 2 half_px + 1 pixels; the field is continued beyond its edge."""
+    """Close by a square of 2 half_px + 1 pixels; the field is continued beyond its edge."""
     padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
     return -_largest(-_largest(padded, half_px), half_px)
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """The largest value in the square around each pixel whose square lies inside, axis by axis."""
+    """Return the largest value in the square around each pixel whose square lies inside, computed axis by
+    axis.
+    """
     size = 2 * half_px + 1
     return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
 
@@ -179,14 +186,16 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2): height missing on slopes, by turned axes x', y'.
+    """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), with turned axes x',
+    y'.
 
-    With cx = cy = c this is c |grad H|^p in any direction. With p = 1 each edge is set back by about c.
+    With cx = cy = c the loss is c |grad H|^p in any direction. With p = 1 each edge is set back by about
+    c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)
     along_x, along_y = turn.cos() * x + turn.sin() * y, turn.cos() * y - turn.sin() * x
-    # A fit may come below zero by a rounding, which has no power.
+    # Rounding can leave a fitted value below zero, of which a power is not defined.
     loss_x, loss_y = values["along_x_um"].clamp(min=0), values["along_y_um"].clamp(min=0)
     whole = loss_x + loss_y
     share_x, share_y = ((one / whole.clamp(min=1e-12)) ** (2 / power) for one in (loss_x, loss_y))

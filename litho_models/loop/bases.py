@@ -1,4 +1,4 @@
-"""The base models that the loop may correct: the one that is asked for, or several small ones."""
+"""Choose the base models that the loop may correct: the one that is asked for, or several small ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# Bases that compete by default. The first has the form of the paper's physics.
+# Base models that compete by default. The first has the form of the paper's physics.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
@@ -35,7 +35,8 @@ def bases_for(
     """Return the models that may be corrected, by name. A network is trained once without each fold.
 
     Args:
-        base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
+        base: name of a model, a frozen model (its folder, ``zoo:NAME``), or ``auto``, with which small models
+            compete.
         study: scans, folds, seed, workers.
         steps: optimiser steps of a network, None: those of its recipe; ``cache``: folder for its trainings.
         fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.

@@ -23,21 +23,21 @@ from litho_models.loop.search import Cause, describe, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-# Largest further gain by variants of a cause's change, as a share of its gain. In trials on the virtual fab
-# true causes leave less than 1 % (layer-stacking 10 %), and effects that only resemble the cause leave 20 %
-# and more.
+# Largest further gain that variants of a cause's change may have, as a share of the cause's gain. In trials
+# on the virtual fab, variants of true causes gain less than 1 % (layer-stacking 10 %), and variants of
+# effects that only resemble the cause gain 20 % and more.
 FORM_SHARE = 0.15
 
 
 @dataclass(frozen=True)
 class Check:
-    """Checks the causes of one model against everything that could replace them.
+    """Check the causes of one model against everything that could replace them.
 
     Attributes:
         state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all candidates that could
             replace a cause.
         left_nm2: squared error that features of layout and position still explain beside the model.
-        secants: those of the laws.
+        secants: secants of the laws.
     """
 
     state: State
@@ -49,16 +49,16 @@ class Check:
 
     @property
     def laws_in(self) -> list[str]:
-        """Names of the laws in the model."""
+        """Return the names of the laws in the model."""
         return [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
 
     @property
     def study(self) -> Study:
-        """The study that the model is fitted to."""
+        """Return the study that the model is fitted to."""
         return self.state.study
 
     def of(self, cause: Cause) -> Cause:
-        """Judge one cause with everything else in the model."""
+        """Judge one cause together with everything else in the model."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
         reshaped_nm2 = reshaped_gain(without, self.state)
@@ -73,18 +73,18 @@ class Check:
             reason = f"beside {', '.join(self.laws_in)} it gains less than half of what it gains without them"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
             reason = f"its best strength is beyond the largest possible one: {', '.join(exhausted)}"
-        # Any columns explain a small part of causes that are still missing, so a small gain proves nothing.
+        # If a small part of the causes is still missing, any columns explain some of it, so a small gain
+        # proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"variants of its change gain another {100 * share:.0f} %"
             reason = f"only resembles the cause: {taken}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Name of a much larger law, or of a much larger cause of which a variant takes half of this cause's
-        gain.
+        """Name a much larger law, or a much larger cause of which a variant takes half of this cause's gain.
 
         A cause with at most a tenth of another's gain may only correct the other's formula. Laws are
-        approximate anyway. Empty if there is none.
+        approximate anyway. Return an empty name if there is no such law or cause.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -115,8 +115,8 @@ class Check:
     def beside_table(self, cause: Cause) -> Cause:
         """Refuse the name of a cause that passed all other checks if it is part of a larger table.
 
-        The cause is refused if the best table instead of it gains over twice as much, and the cause gains
-        nothing beside the table.
+        The cause is refused if the best table in its place gains over twice as much, and the cause gains
+        nothing in addition to the table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -128,7 +128,9 @@ class Check:
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """The law with the largest predicted gain, if that is a fair part of the cause's gain."""
+        """Return the law with the largest predicted gain, if that is at least a fair part of the cause's
+        gain.
+        """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
@@ -141,7 +143,7 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Gain (nm²) of variants of a cause's change on held-out scans, in addition to the change itself.
+    """Return the gain (nm²) that variants of a cause's change add on held-out scans.
 
     Args:
         without, state: model without and with the cause.
@@ -152,7 +154,8 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    # Weight of "no variant", in scans. Without it so many parameters would fit the noise of a few scans.
+    # Weight of the prior for "no variant", in scans. Without it, so many parameters would fit the noise of a
+    # few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
@@ -164,7 +167,7 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
     """Return a change of the prediction (y, x), µm, and its variants."""
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
-    # Widths in pixels, so that they are small relative to the resolution of any process, also on films.
+    # Widths are in pixels, so that they are small relative to the resolution of any process, including films.
     near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
     soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]

@@ -1,9 +1,10 @@
-"""Close the loop on a set of scans: find causes and laws in the residual of a base.
+"""Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search for causes is run beside each base, and bases are compared with their causes.
+The search for causes is run with each base model, and the base models are compared with their causes
+included.
 
-``close`` is an estimator. It chooses and fits on the given scans, and its result predicts any other scan. To
-judge the choices on some scans, call it on the others.
+``close`` is an estimator. It makes choices and fits on the given scans, and its result predicts any other
+scan. To judge the choices on some scans, call ``close`` on the others.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ class Closed:
 
     Attributes:
         base_name: name of the chosen base; ``rivals``: results of the same search beside the other bases.
-        plain: the base fitted to the original scans; ``base``: the base fitted to the freed scans.
-        named: result of the search among causes; ``lawful``: of the search for short laws beside them.
+        plain: the base fitted to the original scans; ``base``: the base fitted to scans freed of what groups
+            share.
+        named: result of the search among causes; ``lawful``: result of the search for short laws in addition
+            to the causes.
         described: tables over a covariate, which describe the remaining error; they act last in the model.
         rests: what features of layout and position still explain after each stage.
         untestable: effects that could not be tested, with reasons.
@@ -53,32 +56,32 @@ class Closed:
 
     @property
     def given(self) -> Study:
-        """The original scans."""
+        """Return the original scans."""
         return self.plain.study
 
     @property
     def study(self) -> Study:
-        """The scans without what groups of them share."""
+        """Return the scans without what groups of scans share."""
         return self.base.study
 
     @property
     def final(self) -> State:
-        """The corrected model, with causes, laws and tables."""
+        """Return the corrected model, with causes, laws and tables."""
         return self.described.state
 
     @property
     def traced(self) -> list[Cause]:
-        """Causes and laws."""
+        """Return causes and laws."""
         return [*self.named.causes, *self.lawful.causes]
 
     @property
     def found(self) -> list[Cause]:
-        """All findings that are reported."""
+        """Return all findings that the report lists."""
         return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Whether every other base lacks the cause too, except bases with more parameters, which may have
-        absorbed it.
+        """Return whether every other base lacks the cause too; bases with more parameters, which may have
+        absorbed it, are ignored.
         """
         base = self.plain.twin.own
         small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
@@ -90,7 +93,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
     Args:
         study: development scans.
-        bases: simulators by name. Those with few parameters are refitted.
+        bases: simulators by name. Base models with few parameters are refitted.
     """
     plain = {}
     for name, base in bases.items():
@@ -123,7 +126,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     for name, state in (
         ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
     ):  # fmt: skip
-        # Stages are told apart by their model: one that changes nothing equals the stage before it.
+        # Stages are identified by their model: a stage that changes nothing equals the stage before it.
         stages.setdefault(state, name)
     return Closed(
         base_name=chosen,
@@ -139,7 +142,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
 
 def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
-    """The bases beside which a search found the cause, or one of its set."""
+    """Name the bases with which a search found the cause, or an effect that looks the same."""
     alike = {cause.name, *cause.alike}
     return [
         name
@@ -149,7 +152,9 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 
 
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """Of the bases that do as well as the best the one whose causes the others share, with fewest numbers."""
+    """Choose among the bases that do as well as the best: the one whose causes the others share, with the
+    fewest parameters.
+    """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
         name: (
@@ -163,7 +168,8 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Search for laws, then tables, beside the causes, and check each cause beside everything else.
+    """Search for laws, then tables, in addition to the causes, and check each cause together with everything
+    else.
 
     A cause that fails is removed, and the search for laws is repeated without it.
 
@@ -189,8 +195,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # Causes that may only correct another formula are removed first, so that formula is judged without
-        # them.
+        # Causes that may only correct another formula are removed first, so that this formula is judged
+        # without them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -200,7 +206,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """Add to the model every table that is still confirmed when fitted with all other parts."""
+    """Add to the model every table that is still confirmed when it is fitted with all other parts."""
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
@@ -214,7 +220,7 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
     """Add the largest table to the model if it gains more than all causes together.
 
-    A table fits almost anything, so it is compared with all causes together, not with single ones.
+    A table fits almost anything, so it must gain more than all causes together, not just more than one.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

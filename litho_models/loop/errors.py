@@ -1,4 +1,4 @@
-"""Errors of a loop's models on held-out scans, each with its own measurement model."""
+"""Compute the errors of a loop's models on held-out scans, each with its own measurement model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Errors of maps (y, x), µm, under each reported policy. Scans of films have no free zero.
+    """Return the errors of maps (y, x), µm, under each reported policy. Scans of films have no free zero.
 
     Args:
         numbers: number of fitted parameters of printer and measurement;
@@ -70,7 +70,7 @@ def error_rows(
 
 
 class HeldOut:
-    """Models of a loop, fitted with their measurement models to scans that are not scored.
+    """The models of a loop, fitted together with their measurement models to scans that are not scored.
 
     Args:
         closed: result of ``close``.
@@ -84,14 +84,14 @@ class HeldOut:
 
     @property
     def ends(self) -> dict[Stage, State]:
-        """The base and the corrected model."""
+        """Return the base and the corrected model."""
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Errors of all models, each scan predicted without its fold; of base and final model also without
-        its print.
+        """Return the errors of all models. Each scan is predicted without its fold; base and final model also
+        predict it without its print.
 
-        If it differs from both, the model with only the causes is listed between them.
+        The model with only the causes is listed between base and final model if it differs from both.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
@@ -113,13 +113,13 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """Predicted scans (y, x), with print and measurement learned without the scan's fold."""
+        """Predict scans (y, x), with print and measurement learned without the scan's fold."""
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """Increase of the error (k = 1) without each cause or law, after the others are refitted.
+        """Return how much the error (k = 1) grows without each cause or law, after the others are refitted.
 
-        The printer's own values stay fixed, and the measurement is learned again.
+        The printer's own parameters stay fixed, and the measurement is learned again.
         """
 
         def error_nm(state: State) -> float:
@@ -134,7 +134,9 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Residual maps (y, x), nm, of all scans before and after, without the offset of each scan."""
+        """Return the residual maps (y, x), nm, of all scans before and after, without the offset of each
+        scan.
+        """
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
             left = np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan)
@@ -156,10 +158,11 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Maps of all scans by fits without their part, and the largest number of parameters of these fits.
+        """Predict all scans by fits without their part; also return the largest number of parameters of these
+        fits.
 
         Args:
-            starts: part to the start of its fit.
+            starts: maps a part of the scans to the start of its fit.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -171,7 +174,7 @@ class HeldOut:
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, maps: Maps) -> Maps:
-        """The maps with the smooth background of the training scans: the published protocol."""
+        """Add the smooth background of the training scans to the maps, as in the published protocol."""
         found = list(maps)
         for twin, (rest, own) in zip(self.closed.plain.per_fold, self.study.folds, strict=True):
             heights = [twin.height(self.study.scans[i]) for i in rest]
@@ -191,7 +194,9 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Errors of all scans by models chosen without them; ``found``: these models, and the scans of each."""
+    """Return the errors of scans under models chosen without them; ``found`` contains these models and their
+    scans.
+    """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))
     for models, out in found:

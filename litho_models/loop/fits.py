@@ -1,6 +1,6 @@
-"""Fit a model of the printer to all scans, and without each fold, to predict that fold.
+"""Fit a model of the printer to all scans, and without each fold, in order to predict that fold.
 
-Terms of single scans are projected out, so they do not bias the values of the printer.
+Per-scan terms are projected out, so they do not bias the parameters of the printer.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# Free terms of each scan in a fit. The gain is not one of them, because long-range effects change it.
+# Terms that are free for each scan in a fit. The gain is not free, because long-range effects change it.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
-# Free terms of each scan in a comparison of errors.
+# Terms that are free for each scan when errors are compared.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
 
@@ -46,7 +46,7 @@ class Study:
     """Scans with their folds, and the settings by which findings are judged.
 
     Attributes:
-        scans: prepared; ``fold_of``: (scans,) number of the fold of each scan.
+        scans: prepared scans; ``fold_of``: (scans,) number of the fold of each scan.
         seed: seed of folds, calibration blocks and permutations.
         workers: pool for independent fits; ``report``: gets progress messages.
     """
@@ -77,36 +77,36 @@ class Study:
         return Study.dealt(scans, len(self.folds), self.seed, self.workers)
 
     def __getstate__(self) -> dict[str, object]:
-        """Drop workers and progress messages, which do not exist in another process."""
+        """Drop workers and progress messages, which cannot be sent to another process."""
         return {**self.__dict__, "workers": HERE, "report": _silent}
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
-        """For each fold the indices of the scans outside and inside it."""
+        """Return for each fold the indices of the scans outside and inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
     @property
     def windows(self) -> list[PreparedScan]:
-        """The part of each scan that fits and screening use."""
+        """Return the part of each scan that fits and screening use."""
         return [scan.window for scan in self.scans]
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Radius of the first scan's tip, or its upper bound, if the store has one."""
+        """Return the radius of the first scan's tip, or its upper bound, if the store has one."""
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
     @property
     def of_films(self) -> bool:
-        """Whether the scans are micrographs of a film, whose edges are scored and whose heights do not
-        drift.
+        """Return whether the scans are micrographs of a film; their edges are scored, and their heights do
+        not drift.
         """
         return self.scans[0].stored.seen_by == "sem"
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
-        """The groups of the scans."""
+        """Return the groups of the scans."""
         return groupings([scan.stored for scan in self.scans])
 
 
@@ -127,7 +127,7 @@ class State:
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_nm2: np.ndarray
-    # Cached models without one effect; several steps need the same one.
+    # Cached models without one effect, because several steps need the same model.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
@@ -135,7 +135,7 @@ class State:
         return float(self.freed_nm2.mean())
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the scans when a state is sent to another process."""
+        """Leave the scans out when a state is sent to another process."""
         return {**self.__dict__, "study": None}
 
     def without(self, name: str) -> State:
@@ -145,7 +145,7 @@ class State:
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predicted prints (y, x) of the scans or their windows, each by the model fitted without its
+        """Predict the prints (y, x) of the scans or their windows, each by the model fitted without its
         fold.
         """
         folds = zip(self.study.fold_of, scans, strict=True)
@@ -153,14 +153,14 @@ class State:
 
 
 class TwinProblem:
-    """Least-squares problem of a model on windows of scans, with one-sided difference quotients."""
+    """The least-squares problem of a model on windows of scans, with one-sided difference quotients."""
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin = twin
         self._windows = windows
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
-        """Residuals, derivatives and free terms of all windows."""
+        """Return the residuals, derivatives and free terms of all windows."""
         here = self._twin.at(vector)
         steps = here.steps()
         moved = [here.at(vector + one) for one in np.diag(steps)]
@@ -177,7 +177,7 @@ class TwinProblem:
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
             if slot is not None and not twin.is_of(slot, window):
                 continue
-            # Only the steps of the chain before a parameter can be reused.
+            # Only the steps of the chain before the changed parameter can be reused.
             known = other.base_height(layout, window) if slot is None else None
             if slot is not None and get_effect(slot.effect).acts_on == "height":
                 known = base
@@ -185,12 +185,14 @@ class TwinProblem:
         return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
-        """Measured minus predicted heights of all windows, µm."""
+        """Return the measured minus predicted heights of all windows, µm."""
         twin = self._twin.at(vector)
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Largest allowed steps: effects stay in range, and the base moves only a little at once."""
+        """Return the largest allowed steps: effects stay in range, and the base parameters change only a
+        little at once.
+        """
         return self._twin.at(vector).room()
 
 
@@ -223,8 +225,8 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
     """Choose the start of a fit, the current values or the base's default values, by a fit to some scans.
 
-    A base that was fitted without an effect has absorbed part of it, and may then be stuck in a local optimum
-    when the effect is added.
+    A base that was fitted without an effect has absorbed part of it, and may be stuck in a local optimum when
+    the effect is added.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
@@ -238,15 +240,17 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Project the free terms of a scan out of columns (n, m) at the sampled pixels; prediction (y, x), µm."""
+    """Project the free terms of a scan, at its prediction (y, x), µm, out of columns (n, m) at the sampled
+    pixels.
+    """
     basis = window.free_basis(prediction_um, terms)
     return columns - basis @ (basis.T @ columns)
 
 
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
-    """Fit the model to some of the windows with the derivatives of the common fit.
+    """Fit the model to some of the windows, using the derivatives of the common fit.
 
-    The fit starts from the common fit, which has seen all windows, so it must converge fully.
+    The fit starts from the common fit, which has seen all windows, so it must be iterated to convergence.
     """
     twin = common.of_fold(fold)
     problem, vector = TwinProblem(twin, windows), twin.vector
@@ -259,7 +263,7 @@ def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Seq
     for _ in range(6):
         step = solve_damped(normal, right, 1e-6, twin.at(vector).room())
         trial = vector + step
-        # For so small a step the linear model is exact enough.
+        # For such a small step the linear model is exact enough.
         if promised_gain(normal, right, step) <= 1e-4 * total:
             vector = trial
             break

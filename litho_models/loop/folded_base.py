@@ -11,12 +11,12 @@ from litho_data.commands.progress import progress
 from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 
-# Sent to other processes for training.
+# A function that trains a model; it is sent to other processes.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 
 
 class FoldedBase(nn.Module):
-    """One trained model per fold; each scan is predicted by the model trained without it.
+    """One trained model per fold; each scan is predicted by the model that was trained without it.
 
     Args:
         models: by fold; ``fold_of``: scan id to fold; ``common``: model for all other scans.
@@ -27,15 +27,15 @@ class FoldedBase(nn.Module):
         self.models = nn.ModuleList(models)
         self.common = common
         self.fold_of = dict(fold_of)
-        # Weights stay as trained, because freezing would change roundings.
+        # Weights stay as trained, because freezing would change their rounding.
         self.eval()
 
     def of_fold(self, fold: int) -> nn.Module:
-        """The model trained without this fold."""
+        """Return the model trained without this fold."""
         return self.models[fold]
 
     def of_scan(self, scan_id: str) -> nn.Module:
-        """The model trained without this scan."""
+        """Return the model trained without this scan."""
         fold = self.fold_of.get(scan_id)
         return self.common if fold is None else self.models[fold]
 
@@ -43,7 +43,7 @@ class FoldedBase(nn.Module):
 def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
-    """Train once without each fold and once on all development scans."""
+    """Train a model without each fold, and one on all development scans."""
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
     # The last model belongs to no fold.
     last = max(fold.values()) + 1

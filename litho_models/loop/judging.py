@@ -1,4 +1,4 @@
-"""Decide whether held-out scans confirm a change of the model. Scans are the units."""
+"""Decide whether held-out scans confirm a change of the model; scans are the units of the tests."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ from litho_models.loop.fits import Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
-# Limit of p for a grouping. It is strict because every candidate is tried with every grouping.
+# Limit of p for a grouping. The limit is strict because every candidate is tried with every grouping.
 EXCHANGED_P = 0.01
-# Seven gains in seven scans have p = 1/128 by chance, so fewer than eight scans confirm nothing.
+# If all of seven scans improve, p is 1/128 by chance, so fewer than eight scans confirm nothing.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# A strength by group has passed the test with permuted labels, so half of the scans may gain nothing.
+# A strength by group has already passed the test with permuted labels, so up to half of the scans may gain
+# nothing.
 GROUPED_P = 0.05
 # Smallest share of the squared error that justifies a strength by group, or a search. A change of the model
-# must gain twice that (1 % of the root), because every formula is slightly wrong.
+# must reduce the squared error by twice this share (1 % of the root), because every formula is slightly
+# wrong.
 SMALLEST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Gain of a change on held-out scans.
+    """The gain of a change (reduction of the squared error) on held-out scans.
 
     Attributes:
         before_nm2, gain_nm2: mean squared error before the change, and its decrease.
@@ -40,20 +42,20 @@ class Judgement:
 
     @property
     def improved(self) -> tuple[int, int]:
-        """Number of improved scans, and of all scans."""
+        """Return the number of scans that improve, and the number of all scans."""
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
     @property
     def matters(self) -> bool:
-        """Whether the gain is large enough to be useful."""
+        """Return whether the gain is large enough to be useful."""
         return self.gain_nm2 >= 2 * SMALLEST_SHARE * self.before_nm2
 
     def passed(self, *, grouped: bool = False) -> bool:
-        """Whether the change is confirmed."""
+        """Return whether the change is confirmed."""
         return not self.reason(grouped=grouped)
 
     def reason(self, *, grouped: bool = False) -> str:
-        """Why the change is not confirmed; empty if it is."""
+        """Return why the change is not confirmed; empty if it is confirmed."""
         better, count = self.improved
         if count < FEWEST_SCANS:
             return f"{count} scans, at least {FEWEST_SCANS} are needed to confirm anything"
@@ -74,6 +76,8 @@ def judge(before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study) -> Judgem
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Whether a rival is worse than the best in nearly every scan, and by at least a quarter of the gain."""
+    """Return whether a rival is worse than the best in nearly every scan, and by at least a quarter of the
+    gain.
+    """
     lost = judge(other_nm2, best_nm2, study)
     return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

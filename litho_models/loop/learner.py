@@ -1,7 +1,7 @@
 """Estimate how much of a residual could still be learned, by a cross-validated ridge regression.
 
-The ridge uses features of layout and position. It names nothing and enters no model. It shows whether the
-residual has structure, and how large a named cause is in comparison.
+The ridge uses features of layout and position. The ridge names no cause and is part of no model. It shows
+whether the residual has structure, and how large this structure is compared with a named cause.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from litho_models.models.features import Features, FeaturesConfig, RandomFeature
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# Largest number of rows; with more scans each scan gets fewer.
+# Largest memory of the feature rows; with more scans, each scan contributes fewer rows.
 _KEPT_BYTES = 512 * 2**20
-# Features whose strength may depend on order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6
-# µm.
+# Features whose strength may depend on order or dose: height, |∂y| and |∂x| at 0.3 µm, and surroundings of
+# 1.6 µm.
 _VARYING = (18, 21, 22, 7)
 
 
@@ -49,29 +49,33 @@ class Rest:
 
     @property
     def share(self) -> float:
-        """Explained share of the squared error."""
+        """Return the explained share of the squared error."""
         return self.mean_nm2 / max(float(self.squares_nm2.mean()), np.finfo(float).tiny)
 
     @cached_property
     def ci95_nm2(self) -> tuple[float, float] | None:
-        """Interval over scans of the mean gain; None with fewer than six scans."""
+        """Return the interval over scans of the mean gain; None with fewer than six scans."""
         return interval(self.gains_nm2.tolist())
 
     @property
     def most_nm(self) -> float:
-        """Root of the upper end of the interval: upper bound of the rms error of the model's form."""
+        """Return the root of the interval's upper end, an upper bound of the rms error of the model's
+        form.
+        """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
-        """Whether the residual can be learned: by more than 1 %, with an interval that excludes zero."""
+        """Return whether the residual can be learned: the share exceeds 1 %, and the interval excludes
+        zero.
+        """
         low, _ = self.ci95_nm2 or (0.0, None)
         return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
-    """Feature rows of the scans of a study, computed once for any number of residuals.
+    """The feature rows of the scans of a study, computed once for any number of residuals.
 
     Args:
         study: scans and folds.
@@ -83,7 +87,8 @@ class Learner:
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
-        # Order, and dose minus nominal dose. A dependence needs at least three values.
+        # Order, and the difference from the nominal dose. A dependence on one of them needs at least three
+        # values.
         facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
@@ -99,7 +104,8 @@ class Learner:
         )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
-        """Explain measured minus predicted heights of each scan by a ridge fitted to scans of other folds.
+        """Explain the residual of each scan (measured minus predicted heights) by a ridge fitted to scans of
+        other folds.
 
         Args:
             predictions: held-out predictions (y, x) µm, one per scan.
@@ -118,11 +124,13 @@ class Learner:
         return Rest(squares - left, squares)
 
     def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
-        """Features of layout and position, and products of some with order and dose, (m, n)."""
+        """Return the features of layout and position, and products of some features with order and dose, (m,
+        n).
+        """
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
-        # Height, ∂y and ∂x: a gain and a displacement whose strength may depend on position.
+        # Height, ∂y and ∂x stand for a gain and a displacement whose strength may depend on position.
         placed = (18, 19, 20)
         columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
         for value in varied:
@@ -136,7 +144,7 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Mean squared residual (scans,) of ridges fitted and regularised without each scan's fold."""
+    """Return the mean squared residual (scans,) of ridges fitted and regularised without each scan's fold."""
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
     # Strength of regularisation, in scans.
@@ -146,7 +154,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # A single scan cannot choose a strength, so the largest is used.
+        # A single scan cannot choose a strength of regularisation, so the largest is used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
@@ -155,7 +163,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
 
 
 def _all_features(scan: PreparedScan) -> Features:
-    """The layout features of the zoo's models, except random ones, for scans like this one."""
+    """Return the layout features of the zoo's models for scans like this one, except the random features."""
     first = scan.stored
     config = RandomFeaturesConfig.of_variant(
         pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
@@ -164,15 +172,16 @@ def _all_features(scan: PreparedScan) -> Features:
 
 
 def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
-    """Products of splines along y and x at flat indices of a scan, shape (25, n)."""
+    """Return the products of splines along y and x at flat indices of a scan, shape (25, n)."""
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
     return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
 
 
 def _splines(size: int) -> np.ndarray:
-    """Cubic splines (5, size) over the sampled part of an axis, constant beyond it; they add up to 1.
+    """Return the cubic splines (5, size) over the sampled part of an axis; they add up to 1 and are constant
+    beyond it.
 
-    Beyond the sampled part a spline would be determined by no measured pixel.
+    Beyond the sampled part no measured pixel would determine a spline.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])

@@ -1,4 +1,4 @@
-"""Marks seen directly in single scans, without a model: rounding, scars, short lines, bends.
+"""Find marks directly in single scans, without a model: rounding, scars, short lines, bends.
 
 Marks are reported with evidence but enter no model, because they do not lower errors on held-out scans.
 """
@@ -18,7 +18,7 @@ from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
-# Longer than the resolution of tip and spot, shorter than a line-shaped feature.
+# These lags are longer than the resolution of tip and spot, and shorter than a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
 # Smaller amounts exist but do not matter.
 _SMALLEST_RMS_NM = 0.5
@@ -42,10 +42,10 @@ def marks(
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
-    """Merge terms and marks by name; a name is seen if either list has seen it."""
+    """Merge terms and marks by name; a name counts as seen if either list contains it as seen."""
     found = {one.name: one for one in findings}
     for mark in seen:
-        # The first that has seen it counts.
+        # Of two findings with the same name, the one that was seen is kept.
         pair = sorted((found.get(mark.name, mark), mark), key=lambda one: not one.seen)
         evidence = "; ".join(dict.fromkeys(one.evidence for one in pair))
         found[mark.name] = pair[0].model_copy(update={"evidence": evidence})
@@ -53,10 +53,10 @@ def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> 
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Common step of all heights of a raw scan, up to one offset; 0 if there is none."""
+    """Find the common step of all heights of a raw scan, up to one offset; return 0 if there is none."""
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
-    # Smaller differences are rounding of single precision.
+    # Smaller differences come from rounding in single precision.
     steps = steps[steps > 1e-6 * np.ptp(heights)] if len(heights) > 2 else steps[:0]
     if not len(steps):
         return 0.0
@@ -89,14 +89,16 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
-    """Numbers of outliers that are elongated along the scan lines, and across them."""
+    """Count the outliers that are elongated along the scan lines, and those that are elongated across
+    them.
+    """
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
     sizes, along, across = np.bincount(numbered.ravel()), 0, 0
     for number, box in enumerate(find_objects(numbered), 1):
         height, width = (part.stop - part.start for part in box)
-        # Fewer pixels are noise; a scratch is at least four times as long as wide.
+        # Patches with fewer pixels are noise; a scratch is at least four times as long as wide.
         if sizes[number] >= 9:
             along += width >= 4 * height
             across += height >= 4 * width
@@ -106,7 +108,8 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
 def _short_lines(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
 ) -> ScanFinding:
-    """Report short lines: residual shared by neighbours along a scan line but not across, in flat places.
+    """Report short lines: in flat places, neighbours along a scan line share the residual, but neighbours
+    across do not.
 
     Slopes are left out, because model errors there are not noise.
     """
@@ -124,7 +127,7 @@ def _short_lines(
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
-    """Mean product of residuals some lags apart, along the lines and across them, nm²."""
+    """Return the mean product of residuals some lags apart, along and across the lines, nm²."""
     slope = np.hypot(*np.gradient(prediction))
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
@@ -150,7 +153,7 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Report scans that registration straightened; everything else uses the straightened scans."""
+    """Report scans that registration straightened; all other steps use the straightened scans."""
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:

@@ -1,4 +1,4 @@
-"""Fit printer and measurement together, and free scans of what groups of them share."""
+"""Fit printer and measurement together, and free scans of what groups of scans share."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ class Fit(NamedTuple):
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """Number of fitted parameters of printer and measurement."""
+        """Return the number of fitted parameters of printer and measurement."""
         return len(self.twin.vector), self.measurement.numbers
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
-        """The map (y, x) that a scan should show."""
+        """Return the map (y, x) that a scan is expected to show."""
         return self.measurement.expected_um(scan.stored, self.twin.height(scan))
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
     """Subtract from each scan what the scans of a group share in addition to their prints.
 
-    What all scans share stays, because a cause may explain it. The subtracted part is learned without the
-    scan's fold.
+    What all scans share is not subtracted, because a cause may explain it. The subtracted part is learned
+    without the scan's fold.
     """
     study = state.study
     maps = state.maps_um(study.scans)

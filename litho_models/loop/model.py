@@ -1,4 +1,4 @@
-"""The twin: a base model with effects whose strength is the same for all scans or differs by group."""
+"""The twin: a base model with effects whose strengths are the same for all scans or differ by group."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _AT_BOUND = 1e-6
 
 @dataclass(frozen=True)
 class Slot:
-    """One fitted parameter of an effect; ``label``: its group of scans, None for all scans."""
+    """One fitted parameter of an effect; ``label`` is its group of scans, or None for all scans."""
 
     effect: str
     parameter: str
@@ -36,7 +36,7 @@ class Slot:
 
     @property
     def facts(self) -> Parameter:
-        """The catalogue's entry for this parameter."""
+        """Return the catalogue's entry for this parameter."""
         return get_effect(self.effect).parameters[self.parameter]
 
 
@@ -44,15 +44,17 @@ class Slot:
 class Added:
     """An effect in a model.
 
-    ``by``: the grouping in which its amplitudes differ, ``all`` for one strength; ``values``: its parameters
-    by label, ``""`` for all scans.
+    ``by`` is the grouping in which its amplitudes differ, or ``all`` for one strength. ``values`` contains
+    its parameters by label, with ``""`` for all scans.
     """
 
     by: str
     values: Values
 
     def of(self, label: str | None) -> dict[str, float]:
-        """The parameters of a group; for a group that was never fitted, the mean of the fitted ones."""
+        """Return the parameters of a group; for a group that was never fitted, return the mean of the fitted
+        ones.
+        """
         if label is not None and label in self.values:
             return dict(self.values[label])
         first = next(iter(self.values.values()))
@@ -80,23 +82,23 @@ class Twin:
 
     @classmethod
     def bare(cls, base: nn.Module) -> Twin:
-        """A twin without effects."""
+        """Make a twin without effects."""
         return cls(base, _numbers(base))
 
     @property
     def own(self) -> int:
-        """The number of fitted parameters of the base."""
+        """Return the number of fitted parameters of the base."""
         return len(self.numbers)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the effects, in the order in which they act."""
+        """Return the names of the effects, in the order in which they act."""
         return tuple(in_forward_order(list(self.effects)))
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """The fitted parameters of the effects, in the order of ``vector``, where they follow those of the
-        base.
+        """Return the fitted parameters of the effects, which follow those of the base in ``vector`` in this
+        order.
         """
         return [
             Slot(name, key, label)
@@ -108,12 +110,12 @@ class Twin:
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """All fitted parameters, those of the base first."""
+        """Return all fitted parameters, first those of the base."""
         of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
         return np.concatenate([self.numbers, of_slots])
 
     def at(self, vector: np.ndarray) -> Twin:
-        """The same twin with other parameters."""
+        """Return the same twin with other parameters."""
         values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
         for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
             for label, own in values[slot.effect].items():
@@ -123,7 +125,7 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """The same effects over the base trained without this fold, if there is one."""
+        """Return the same effects with the base trained without this fold, if there is such a base."""
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
@@ -144,7 +146,7 @@ class Twin:
         return self.only(())
 
     def ungrouped(self) -> Twin:
-        """Replace strengths by group by their mean; parameters in the order in which effects act."""
+        """Replace strengths by group by their mean, and sort parameters in the order in which effects act."""
         effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
         return replace(self, effects=effects)
 
@@ -155,23 +157,23 @@ class Twin:
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
     def values(self, label_in: Mapping[str, str]) -> dict[str, dict[str, float]]:
-        """Parameter values of all effects, in the order in which they act, for scans with these labels by
-        grouping.
+        """Return the parameter values of all effects, in the order in which they act, for scans with these
+        labels.
         """
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
-        """The scan's label in every grouping in use."""
+        """Return the scan's label in every grouping that is used."""
         return {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
-        """Whether a parameter belongs to the scan's group or to all scans."""
+        """Return whether a parameter applies to this scan: it belongs to the scan's group or to all scans."""
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Restrict strengths by group to the groups of these scans.
+        """Keep strengths by group only for the groups of these scans.
 
-        The strength of any other group becomes the mean of theirs.
+        Every other group gets the mean of their strengths.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -185,7 +187,7 @@ class Twin:
 
     @cached_property
     def fitted_base(self) -> nn.Module:
-        """The base with its fitted parameters; a copy if it has any."""
+        """Return the base with its fitted parameters, as a copy if it has any."""
         if not self.own:
             return self.base
         base = copy.deepcopy(self.base)
@@ -193,7 +195,9 @@ class Twin:
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
-        """The chain of effects for one scan, or with mean strengths; ``extra``: a further effect to try."""
+        """Return the chain of effects for one scan, or with mean strengths; ``extra`` is a further effect to
+        try.
+        """
         labels = {} if scan is None else self.labels(scan)
         key = tuple(labels.values())
         if extra or key not in self._chains:
@@ -206,12 +210,14 @@ class Twin:
 
     @torch.no_grad()
     def exposed(self, scan: PreparedScan) -> Tensor:
-        """The layout (1, 1, y, x), µm, after the effects that act on it."""
+        """Return the layout (1, 1, y, x), µm, after the effects that act on it."""
         return self.chain(scan).before_base(scan.context.layout_um, scan.context)
 
     @torch.no_grad()
     def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
-        """Height (1, 1, y, x), µm, that the base alone predicts for an exposed layout (1, 1, y, x), µm."""
+        """Return the height (1, 1, y, x), µm, that the base alone predicts for an exposed layout (1, 1, y,
+        x), µm.
+        """
         base = self.fitted_base
         return (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
 
@@ -219,21 +225,23 @@ class Twin:
     def height(
         self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
     ) -> np.ndarray:
-        """Predicted height of the print (y, x), µm; ``base_um``: prediction of the base, if known."""
+        """Return the predicted height of the print (y, x), µm; ``base_um`` is the base's prediction, if
+        known.
+        """
         chain = self.chain(scan, extra)
         if base_um is None:
             base_um = self.base_height(chain.before_base(scan.context.layout_um, scan.context), scan)
         return chain.after_base(base_um, scan.context)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Steps (p,) of difference quotients, upwards except at an upper limit."""
+        """Return the steps (p,) of difference quotients, which go upwards except at an upper limit."""
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
         effects = np.where(self.vector[self.own :] + size <= upper, size, -size)
         return np.concatenate([5e-3 * np.maximum(np.abs(own), 0.2), effects])
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest step (p,) that keep base and effects within their ranges."""
+        """Return the smallest and largest step (p,) that keep base and effects within their ranges."""
         lower, upper, _ = self._ranges()
         own, effects = self.vector[: self.own], self.vector[self.own :]
         lowest, highest = parameter_room(self.base, own) if self.own else (own, own)
@@ -243,29 +251,31 @@ class Twin:
         )
 
     def _ranges(self) -> np.ndarray:
-        """Lower bound, upper bound and usual size of each effect parameter, (3, slots)."""
+        """Return the lower bound, upper bound and usual size of each effect parameter, (3, slots)."""
         facts = [slot.facts for slot in self.slots]
         nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
         known = [
-            # A parameter that is usually zero, such as an angle, gets a tenth of its range as usual size.
+            # A parameter that is usually zero, such as an angle, gets a tenth of its range as its usual size.
             (one.lower, one.upper, abs(one.typical - null) or 0.1 * (one.upper - one.lower))
             for one, null in zip(facts, nulls, strict=True)
         ]
         return np.array(known).reshape(-1, 3).T
 
     def free(self) -> np.ndarray:
-        """True for parameters (p,) that are not on a bound."""
+        """Return a mask (p,) that is True for parameters not on a bound."""
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
     def at_bounds(self) -> dict[str, float]:
-        """Fitted values of base and effects that lie on a bound of their range, with that bound."""
+        """Return the fitted values of base and effects that lie on a bound, with that bound."""
         base = self.fitted_base
         found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
-        """Amplitudes of an effect that lie on a limit of their range, other than the null, in some group."""
+        """Name the amplitudes of an effect that lie on a limit of their range, other than the null, in some
+        group.
+        """
         own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
         beyond = (slot for slot, at in own if slot.facts.kind == "amplitude" and at != slot.facts.null)
         return [*dict.fromkeys(slot.parameter for slot in beyond)]
@@ -280,7 +290,7 @@ class Twin:
 
 
 def is_refitted(base: nn.Module) -> bool:
-    """Whether the base has few enough parameters to be fitted together with the effects."""
+    """Return whether the base has few enough parameters to be fitted together with the effects."""
     trainable = any(p.requires_grad for p in base.parameters())
     return trainable and is_small(base) and not isinstance(base, FoldedBase)
 

@@ -17,7 +17,7 @@ from litho_models.loop.record import Planted
 
 
 def parse_planted(text: str) -> tuple[Effect, float]:
-    """Parse ``NAME=AMOUNT`` into effect and amount, in the unit of the effect's first amplitude.
+    """Parse ``NAME=AMOUNT`` into an effect and an amount, in the unit of the effect's first amplitude.
 
     Raises:
         InputError: another form, an unknown effect, a per-scan effect, or no number.
@@ -31,7 +31,7 @@ def parse_planted(text: str) -> tuple[Effect, float]:
     if not separator or not np.isfinite(amount):
         raise InputError("--inject", got=repr(text), wanted="NAME=AMOUNT, such as vignetting=0.1")
     if effect.per_scan:
-        raise InputError("--inject", got=name, wanted="an effect with one value for all scans")
+        raise InputError("--inject", got=name, wanted="an effect with the same parameters in all scans")
     effect.require_in_range({effect.amplitudes[0]: amount})
     return effect, amount
 
@@ -39,7 +39,7 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 def plant(
     effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> Planted:
-    """Plant an effect in copies of the scans, and report what a new loop names.
+    """Plant an effect in copies of the scans, run a new loop on the copies, and report what it names.
 
     Args:
         effect, amount: from ``parse_planted``; ``closed``: result of the loop on the original scans.

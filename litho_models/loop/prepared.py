@@ -1,4 +1,4 @@
-"""Prepare scans for the loop: tensors, sampled pixels, and position."""
+"""Prepare scans for the loop: convert them to tensors, sample pixels, and find positions."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# For scans of this size or larger, fits and screening use one quadrant with a margin.
+# Fits and screening use one quadrant, with a margin, of scans of this size or larger.
 LARGE_PX = 400
 
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """One scan ready to be predicted and compared.
+    """One scan that is ready to be predicted and compared.
 
     Attributes:
         stored: the scan in the store.
@@ -43,7 +43,7 @@ class PreparedScan:
 
     @cached_property
     def usable(self) -> np.ndarray:
-        """Measured pixels, bool (y, x), which are scored."""
+        """Return a mask (y, x) of the measured pixels, which are scored."""
         return self.stored.usable
 
     @property
@@ -55,16 +55,16 @@ class PreparedScan:
         return self if self.quadrant is None else self.quadrant
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
-        """Values of a (…, y, x) map at the sampled pixels, float64."""
+        """Return the values of a (…, y, x) map at the sampled pixels, float64."""
         flat = field_map.detach().cpu().numpy() if isinstance(field_map, Tensor) else field_map
         return flat.reshape(-1)[self.sample].astype(np.float64)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
-        """Smooth scan terms at the sampled pixels, (k, n)."""
+        """Return smooth scan terms at the sampled pixels, (k, n)."""
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
     def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
-        """Orthonormal basis (n, k) of the scan's free terms at a prediction (y, x), µm."""
+        """Return the orthonormal basis (n, k) of the scan's free terms at a prediction (y, x), µm."""
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
 
@@ -83,7 +83,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, with positions in the writing order of the scans that a model was fitted to."""
+    """Prepare further scans, with positions in the writing order of the scans to which a model was fitted."""
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
     def placed(scan: PreparedScan) -> PreparedScan:
@@ -96,7 +96,7 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
     dose = 1.0 if scan.dose is None else float(scan.dose)
-    # Exposure is level times dose, so less dose acts like a lower layout.
+    # Exposure is level times dose, so a smaller dose acts like a lower layout.
     layout = torch.from_numpy(scan.layout_um * np.float32(dose))[None, None]
     write = scan.write or {}
     line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
@@ -119,7 +119,9 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
-    """Give large scans a window; scans take the four quadrants in turn to cover the whole field."""
+    """Give large scans a window; successive scans use different quadrants, so that together they cover the
+    whole field.
+    """
     shape, pitch = scan.stored.shape, scan.stored.pitch_um
     if min(shape) < LARGE_PX:
         return scan
@@ -151,7 +153,7 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
 
 
 def _half(size: int, second: bool) -> tuple[slice, slice]:
-    """Half of an axis, with and without a margin of 48 pixels towards the other half."""
+    """Return one half of an axis, with and without a margin of 48 pixels towards the other half."""
     middle = size // 2
     if second:
         return slice(middle - 48, size), slice(middle, middle + size // 2)
@@ -159,10 +161,11 @@ def _half(size: int, second: bool) -> tuple[slice, slice]:
 
 
 def sample_border_px(size: int) -> int:
-    """Number of pixels at each end of an axis that are not sampled; ``size``: the shortest axis.
+    """Return the number of unsampled pixels at each end of an axis; ``size`` is the length of the shortest
+    axis.
 
-    Their neighbourhood extends beyond the layout. Errors are scored on all pixels, as in the benchmark
-    (``Blocks.border_px``).
+    The neighbourhood of these pixels extends beyond the layout. Errors are scored on all pixels, as in the
+    benchmark (``Blocks.border_px``).
     """
     return min(8, size // 8)
 

@@ -1,4 +1,4 @@
-"""``close_loop.json``, schema 4: the record of a loop, from which report and tables are drawn."""
+"""The record of a loop, ``close_loop.json`` (schema 4), from which report and tables are drawn."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class ErrorRow(Record):
 
     Attributes:
         model: the base, the base with causes, or ``all``, the corrected model.
-        measurement: added to the print: nothing, the smooth background of the training scans (the published
-            protocol), or the whole measurement model.
+        measurement: what was added to the print: nothing, the smooth background of the training scans (the
+            published protocol), or the whole measurement model.
         policy: the ``k`` terms fitted to each scan, on pixels that are not scored.
         held_out: folds of scans, or whole prints; nested if all choices were made without them.
-        printer_numbers: fitted parameters of the model; ``measurement_numbers``: of the measurement, the most
-            in any fold.
+        printer_numbers: fitted parameters of the model; ``measurement_numbers``: fitted parameters of the
+            measurement, the largest number in any fold.
         edge_by_scan_nm: mean distance of the edges, for films.
     """
 
@@ -62,17 +62,17 @@ class ErrorRow(Record):
 
     @property
     def leading_by_scan_nm(self) -> dict[str, float]:
-        """The leading error by scan: of edges for films, of heights otherwise."""
+        """Return the leading error by scan: the error of edges for films, of heights otherwise."""
         return self.edge_by_scan_nm or self.by_scan_nm
 
     @property
     def leading_nm(self) -> float:
-        """Mean of the leading error over scans."""
+        """Return the mean of the leading error over scans."""
         return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
 
     @property
     def is_headline(self) -> bool:
-        """Whether this row is the quoted one: k = 1 (films: 0), shared measurement, folds of scans."""
+        """Return whether this row is the quoted one: k = 1 (films: 0), shared measurement, folds of scans."""
         usual = usual_policy(bool(self.edge_by_scan_nm))
         return (self.policy, self.measurement, self.held_out) == (usual, "shared", "scans")
 
@@ -89,16 +89,16 @@ class Strength(Record):
 
 
 class FoundEffect(Record):
-    """Something added to the model.
+    """An effect, law or table that was added to the model.
 
     Attributes:
         by: the grouping in which its strength differs; ``all`` for one strength.
         strengths: parameter to its numbers.
-        gain_nm2: decrease of the squared error of held-out scans beside everything else, on the fitted
-            pixels, without seven terms and an affine shift per scan.
-        left_out_nm: increase of the mean absolute error without it (k = 1).
+        gain_nm2: decrease of the squared error of held-out scans, in addition to everything else in the
+            model, on the fitted pixels, without seven terms and an affine shift per scan.
+        left_out_nm: increase of the mean absolute error if it is left out (k = 1).
         family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
-        reshaped_share: further gain by variants of its change, as a share of its own gain.
+        reshaped_share: further gain that variants of its change have, as a share of its own gain.
         survives_on: other bases beside which the search also found it.
     """
 
@@ -153,7 +153,7 @@ class ScanFinding(Record):
 
     @classmethod
     def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
-        """Make a finding, by default with title and role of the catalogue."""
+        """Make a finding, by default with the title and role that the catalogue states."""
         effect = CATALOGUE.get(name)
         role = effect.role if effect else "measurement"
         known = {"title": effect.title if effect else name, "role": role, **facts}
@@ -161,10 +161,10 @@ class ScanFinding(Record):
 
 
 class Planted(Record):
-    """An effect planted in copies of the scans, and what the loop found there.
+    """An effect planted in copies of the scans, and what the loop found in these copies.
 
-    ``rms_nm``: rms of its change without the scans' free terms; ``named``: the reported set that contains it,
-    empty if none does; ``found``: the fitted amount.
+    ``rms_nm`` is the rms of its change without the scans' free terms. ``named`` is the reported set that
+    contains it, or empty. ``found`` is the fitted amount.
     """
 
     name: str
@@ -176,8 +176,8 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """Squared error (nm²) of held-out scans that features of layout and position still explain; ``matters``:
-    beyond chance.
+    """The squared error (nm²) of held-out scans that features of layout and position still explain;
+    ``matters`` says whether it exceeds chance.
     """
 
     stage: str
@@ -187,10 +187,11 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """Two answers compared on new prints: by how much the first fits better, in nm² and in standard
+    """Compare two answers on new prints: by how much the first fits better, in nm² and in standard
     deviations.
 
-    ``z`` allows for an error in the model's form; ``difference_nm``: rms difference of the two predictions.
+    ``z`` allows for an error in the model's form; ``difference_nm`` is the rms difference of the two
+    predictions.
     """
 
     better: str
@@ -201,7 +202,7 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """An open question after new prints: the answers declared before, and those that remain."""
+    """An open question after new prints: the answers declared beforehand, and those that remain."""
 
     question: str
     kind: str
@@ -217,9 +218,9 @@ class Decision(Record):
 class CloseLoop(Result):
     """The record of a loop.
 
-    ``errors``: see ``ErrorRow``; ``gain``: error of the base minus that of the corrected model, k = 1, with
-    the shared measurement, over scans and over prints. ``chosen``: how often nested selections chose each
-    effect. ``confounded``: pairs of parameters that these scans cannot determine separately, with their
+    ``errors``: see ``ErrorRow``. ``gain``: the error of the base minus that of the corrected model, at k = 1
+    with the shared measurement, over scans and over prints. ``chosen``: how often nested selections chose
+    each effect. ``confounded``: pairs of parameters that these scans cannot determine separately, with their
     correlation. ``decisions``: answers of further stores to open questions of the first.
     """
 
@@ -258,7 +259,7 @@ class CloseLoop(Result):
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """One row of the errors, by default with the usual terms; None if it was not measured."""
+        """Return one row of the errors, by default for the usual terms; None if it was not measured."""
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)

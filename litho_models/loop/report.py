@@ -15,7 +15,9 @@ Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
-    """Write ``report.html`` and its tables; ``maps``: residuals (y, x), nm, by scan, before and after."""
+    """Write ``report.html`` and its tables; ``maps`` contains residuals (y, x), nm, by scan, before and
+    after.
+    """
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",
         "From the residual on held-out scans to causes and laws, to a corrected model.",

@@ -99,7 +99,7 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """The base's values by their physical names; empty for a base that is not fitted."""
+    """Return the base's values by their physical names; return nothing for a base that is not fitted."""
     base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
         return {}
@@ -144,7 +144,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Fitted values of an effect, with intervals from the scatter over prints (or scans)."""
+    """Return the fitted values of an effect, with intervals from the scatter over prints (or scans)."""
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
@@ -161,13 +161,15 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """The unit of each scan for intervals: its print, or the scan itself if there are too few prints."""
+    """Name the independent unit of each scan for intervals: its print, or the scan itself if there are too
+    few prints.
+    """
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
 
 
 def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
-    """Cluster-robust covariance (p, p) of fitted parameters.
+    """Return the cluster-robust covariance (p, p) of fitted parameters.
 
     Args:
         linear: each window at the optimum; ``units``: the print or scan of each.
@@ -183,7 +185,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 
 
 def confounded(state: State) -> list[tuple[str, str, float]]:
-    """Pairs of parameters that these scans cannot determine separately, with their correlation."""
+    """Return the pairs of parameters that these scans cannot determine separately, with their correlation."""
     twin = state.twin
     normal = eliminated_sum(state.linear, RULES.term_weight)[0]
     free = np.flatnonzero(np.diag(normal) > 0)
@@ -199,7 +201,7 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
-    """Why each other effect was not added; ``seen``: per-scan effects, which are listed elsewhere."""
+    """Explain why each other effect was not added; per-scan effects (``seen``) are listed elsewhere."""
     sets = {other: one.name for one in added for other in one.confusable_with}
     films, first, last = closed.study.of_films, closed.named.first, closed.named.last
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
@@ -222,7 +224,7 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
 def _refused(
     closed: Closed, name: str, sets: Mapping[str, str], untestable: Mapping[str, str]
 ) -> tuple[CandidateVerdict, str]:
-    """Why an effect is not in the model."""
+    """Explain why an effect is not in the model."""
     named, count = closed.named, len(closed.study.scans)
     last, refused = named.last.get(name), named.refused.get(name, "")
     if name in untestable:

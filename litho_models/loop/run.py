@@ -1,4 +1,4 @@
-"""Run the loop on a store and write record, report, tables and the corrected model."""
+"""Run the loop on a store, and write record, report, tables and the corrected model."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 QUESTIONS_FILE = "open_questions.json"
 Nested = Literal["folds", "prints"]
-# Maps a closed loop and its record to the record to write and further records beside it.
+# A function that maps a closed loop and its record to the record to write, and to further records.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
 
 
@@ -55,7 +55,7 @@ def close_loop(
     decided_by: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
-    """Close the loop on a dataset store and write the result to ``out``, which appears when complete.
+    """Close the loop on a dataset store and write the result to ``out``, which appears only when complete.
 
     Args:
         store: made by ``litho-data build``.
@@ -161,7 +161,7 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Repeat all choices without each fold, or print, and judge them there; also count how often each effect
+    """Repeat all choices without each fold, or print, and judge them on it; also count how often each effect
     was chosen.
     """
     scans = [scan.stored for scan in study.scans]
@@ -184,7 +184,9 @@ def _nested(
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
-    """Rounding step of the heights in the raw file of each scan; None if the store has no raw files."""
+    """Return the rounding step of the heights in the raw file of each scan; None if the store has no raw
+    files.
+    """
     try:
         return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
     except InputError:

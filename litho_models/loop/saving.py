@@ -1,4 +1,4 @@
-"""Save the corrected model of the printer, and the laws as a module."""
+"""Save the corrected model of the printer, and save the laws as a module."""
 
 from __future__ import annotations
 

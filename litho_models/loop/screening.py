@@ -24,7 +24,8 @@ from litho_models.scoring.statistics import sign_flips
 
 # Smallest share of a direction's information that the projections must leave for a valid test.
 SMALLEST_RETAINED = 1e-5
-# Share of the smallest useful gain, because derivatives predict the gain of a fit to a factor of three.
+# A candidate is worth fitting at this share of the smallest useful gain, because derivatives predict the gain
+# of a fit only to a factor of three.
 WORTH_FITTING = 0.3
 PERMUTATIONS = 199
 
@@ -68,12 +69,12 @@ class Screened:
         return len(self.trial.sets) * len(self.multiples) + shapes
 
     def start(self) -> dict[str, dict[str, float]]:
-        """Starting values of a fit, by label."""
+        """Return the starting values of a fit, by label."""
         return {label: self.trial.start(own) for label, own in self.multiples.items()}
 
 
 class Screening:
-    """Secants of all trials, and their inner products with the residual of a fitted model.
+    """The secants of all trials, and their inner products with the residual of a fitted model.
 
     Args:
         state: the current model; ``effects``: candidates that it does not contain.
@@ -107,7 +108,7 @@ class Screening:
 
     @cached_property
     def candidates(self) -> dict[str, dict[str, Screened]]:
-        """The best trial of each effect in each grouping."""
+        """Return the best trial of each effect in each grouping."""
         found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
@@ -126,11 +127,11 @@ class Screening:
 
     @property
     def common(self) -> dict[str, Screened]:
-        """The candidates with one strength for all scans."""
+        """Return the candidates with one strength for all scans."""
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """The significant candidates, each with its best grouping, largest gain first."""
+        """Return the significant candidates, each with its best grouping, largest gain first."""
         standing = []
         for own in self.candidates.values():
             grouped = self._grouped(own)
@@ -143,7 +144,9 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """The best grouping, or None if it gains no more than chance over a common strength."""
+        """Choose the best grouping; return None if it gains no more over a common strength than chance
+        does.
+        """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
         best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})
@@ -154,13 +157,13 @@ class Screening:
         return replace(one, group_p=p) if p <= EXCHANGED_P else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
-        """Cosine of the angle between the changes of two candidates, pooled over scans."""
+        """Return the cosine of the angle between the changes of two candidates, pooled over scans."""
         one, other = self._change(a), self._change(b)
         inner = np.einsum("asi,sij,bsj->ab", [one, other], self.freed, [one, other], optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _change(self, one: Screened) -> np.ndarray:
-        """Multiples of all columns, (scans, columns), in the change of a candidate."""
+        """Return by how much each column is multiplied, (scans, columns), in the change of a candidate."""
         found = np.zeros(self.freed.shape[:2])
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
@@ -186,8 +189,8 @@ class Screening:
         columns: Sequence[int],
         taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Held-out gains (scans,), nm², of some columns with strengths by label; also the strengths from all
-        scans.
+        """Return held-out gains (scans,), nm², of some columns with strengths by label; also return the
+        strengths fitted to all scans.
 
         Args:
             taken: factor on the strengths.
@@ -208,7 +211,7 @@ class Screening:
         return gains * NM_PER_UM**2, multiples
 
     def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
-        """Share of permutations of the scans after which some grouping gains as much as this one.
+        """Return the share of permutations of the scans after which some grouping gains as much as this one.
 
         Permutations that leave every group with the same scans are not counted.
         """
@@ -237,7 +240,7 @@ def best_grouping(options: Mapping[str, tuple[float, int]]) -> str | None:
 
 
 def _beside(labels: np.ndarray) -> np.ndarray:
-    """Which scans (n, n) share a label."""
+    """Return a mask (n, n) of pairs of scans that share a label."""
     return labels[:, None] == labels[None, :]
 
 

@@ -1,4 +1,5 @@
-"""Search for causes: add effects while they gain on held-out scans, and test each again at the end.
+"""Search for causes: add effects while they reduce the error on held-out scans, and test each again at the
+end.
 
 All candidates are screened at once, with common strengths and strengths by group. The most promising ones are
 fitted in full before one is chosen, because a derivative at zero strength only estimates the gain of a large
@@ -21,7 +22,7 @@ from litho_models.loop.screening import Screened, Screening, best_grouping
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Labels
 
-# Correlation of changes from which two effects count as indistinguishable.
+# Two effects count as indistinguishable from this correlation of their changes on.
 SAME_COSINE = 0.8
 
 
@@ -32,7 +33,7 @@ class Cause:
     Attributes:
         name, by: the effect, and the grouping of its strength.
         alike: other effects that look the same in these scans.
-        judgement: judgement of its gain on held-out scans, beside the rest of the model.
+        judgement: judgement of its gain on held-out scans, in addition to the rest of the model.
         family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
         values: starting values of its parameters by label, for the fit of a table.
         reshaped_share: further gain by variants of its change, as a share of its gain.
@@ -54,7 +55,7 @@ class Cause:
 
 @dataclass
 class Found:
-    """Result of a search: the model, its causes, and what is known about all other candidates.
+    """The result of a search: the model, its causes, and what is known about all other candidates.
 
     ``failed``: causes whose name was refused.
     """
@@ -93,7 +94,7 @@ def search(
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Find significant tables beside a model, each by a separate linear fit."""
+    """Find significant tables for a model, each by a separate linear fit."""
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
@@ -139,9 +140,9 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
 
 
 def _regroup(found: Found) -> None:
-    """Let the strength of the last added cause differ by group, if that is confirmed.
+    """Let the strength of the last added cause differ by group, if held-out scans confirm that.
 
-    The derivative at the fitted strength is more reliable than the one at zero used in screening.
+    The derivative at the fitted strength is more reliable than the derivative at zero that screening uses.
     """
     cause, twin, study = found.causes[-1], found.state.twin, found.state.study
     slots = {
@@ -176,8 +177,8 @@ def _regroup(found: Found) -> None:
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """Up to three rivals of the best candidate that change much the same and promise at least a third of its
-    gain.
+    """Return up to three rivals of the best candidate that make a similar change and promise at least a third
+    of its gain.
     """
     near = (one for one in standing if one.gain_nm2 >= 0.3 * best.gain_nm2)
     return [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]
@@ -186,7 +187,9 @@ def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) 
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """Effects that look the same in these scans, by their fits if available, otherwise by screening."""
+    """Name the effects that look the same in these scans, by their fits if available, otherwise by
+    screening.
+    """
     own = fitted[one.name]
     by_fit = [
         name
@@ -220,7 +223,7 @@ def _fit(job: tuple[str, Twin, Study]) -> State:
 
 
 def same_change(before: State, one: State, other: State) -> bool:
-    """Whether two states change the held-out prediction in the same way."""
+    """Return whether two states change the held-out prediction in the same way."""
     inner = np.zeros((2, 2))
     for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
         changes = np.stack([old - a, old - b])
@@ -230,7 +233,7 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Test each cause again beside all others, and remove it if it is no longer confirmed."""
+    """Test each cause again together with all others, and remove it if it is no longer confirmed."""
     if len(found.causes) < 2:
         return
     study = found.state.study
@@ -248,7 +251,7 @@ def _defend(found: Found) -> None:
 
 
 def untestable(study: Study) -> dict[str, str]:
-    """Effects that these scans cannot test, with reasons."""
+    """Return the effects that these scans cannot test, with reasons."""
     reasons = {}
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
     for effect in CATALOGUE.values():
@@ -262,6 +265,6 @@ def untestable(study: Study) -> dict[str, str]:
 
 
 def separating(names: Sequence[str]) -> str:
-    """The experiments that would tell the members of a set apart."""
+    """Name the experiments that would distinguish the members of a set."""
     texts = dict.fromkeys(get_effect(name).separating for name in names)
     return "; ".join(text for text in texts if text)

@@ -1,7 +1,7 @@
 """Find terms that differ from scan to scan: datum, gain, bow, drift, registration, line offsets.
 
-Such terms cannot be predicted for the next print, so they enter no model. A term is judged by its variance:
-fitted on one half of a scan's pixels, it must agree with the other half.
+These terms cannot be predicted for the next print, so they enter no model. A term is judged by its variance:
+its fit on one half of a scan's pixels must agree with the other half.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Test each per-scan effect beside those already found; line offsets come last."""
+        """Test each per-scan effect in addition to those already found; line offsets come last."""
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
         names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
@@ -72,7 +72,7 @@ class SingleScans:
         judgement = _as_variance(before, after, self.study)
         values = self.coefficients(own, accepted | own)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
-        # If scans of one print agree, the printer may also be the cause.
+        # If scans of one print agree, the printer may be the cause as well.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
         terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
@@ -91,7 +91,7 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """(scans, k) of ``own`` terms, fitted together with all ``terms``; displacements in µm."""
+        """Fit ``own`` terms together with all ``terms``; return (scans, k), displacements in µm."""
         found = []
         lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):
@@ -102,7 +102,7 @@ class SingleScans:
         return np.stack(found)
 
     def _spread(self, values: np.ndarray, unit: str) -> Strength:
-        """Standard deviation over scans with its bootstrap interval."""
+        """Return the standard deviation over scans with its bootstrap interval."""
         count = len(values)
         draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
         low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
@@ -112,8 +112,8 @@ class SingleScans:
         """Test line offsets along the scan and along the layout, against columns and against each other.
 
         Scans are slightly rotated against their layouts. Lines that follow the layout's rows come from the
-        printer, lines that follow the scan's rows from the microscope. Without rotation they cannot be told
-        apart.
+        printer, and lines that follow the scan's rows come from the microscope. Without rotation they cannot
+        be told apart.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
@@ -152,7 +152,7 @@ class SingleScans:
         return found
 
     def _with_profile(self, axis: int) -> list[np.ndarray]:
-        """Add to the maps the mean residual of each line over scans of other folds.
+        """Add to each map the mean residual of every line over scans of other folds.
 
         Nothing is added if scans differ in size, because their lines do not correspond.
         """
@@ -189,7 +189,7 @@ class SingleScans:
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:
-        """Residual (y, x) of each scan without datum and bow; 0 where not measured."""
+        """Return each scan's residual (y, x) without datum and bow; 0 where not measured."""
         return [
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)
@@ -211,6 +211,6 @@ def _frame(effect: str) -> str:
 
 
 def _columns_of(names: Iterable[str], terms: Terms) -> list[int]:
-    """Columns of ``term_maps(…, terms)`` that belong to the named terms."""
+    """Return the columns of ``term_maps(…, terms)`` that belong to the named terms."""
     wanted = parameter_names(names)
     return [at for at, name in enumerate(parameter_names(terms)) if name in wanted]

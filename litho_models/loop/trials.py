@@ -1,4 +1,6 @@
-"""The parameter sets to try for each candidate, and the changes that they make in the scans."""
+"""Choose the parameter sets to try for each candidate, and compute the changes that they make in the
+scans.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,9 @@ from litho_models.loop.prepared import PreparedScan
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect with the same shape and size, whose amplitudes are fitted together.
+    """Parameter sets of one effect with the same shape and size; their amplitudes are fitted together.
 
-    ``columns``: indices of its changes among those of all trials.
+    ``columns`` are the indices of its changes among those of all trials.
     """
 
     effect: Effect
@@ -29,16 +31,18 @@ class Trial:
 
     @cached_property
     def _facts(self) -> np.ndarray:
-        """Null, lowest and highest value of each amplitude, and its usual distance from the null."""
+        """Return the null, lowest and highest value of each amplitude, and its usual distance from the
+        null.
+        """
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """Distance of each amplitude (…, amplitudes) from its null at multiples (…, sets)."""
+        """Return the distance of each amplitude (…, amplitudes) from its null, at multiples (…, sets)."""
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
-        """Whether no amplitude is beyond a null that bounds it by more than noise can explain.
+        """Return whether every amplitude lies on the allowed side of its null, up to noise.
 
         Values that are small relative to the largest amplitude of any group count as noise; multiples (…,
         sets).
@@ -49,14 +53,16 @@ class Trial:
         return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
-        """Share of the step that stays within the ranges, because a linear extrapolation may leave them."""
+        """Return the share of the step that stays within the ranges, because a linear extrapolation may leave
+        them.
+        """
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
         beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
         return float(np.min(room[beyond] / steps[beyond], initial=1.0))
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
-        """Starting values of a fit, no farther from the null than the largest trial."""
+        """Return the starting values of a fit, no farther from the null than the largest trial."""
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
         steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
@@ -66,13 +72,13 @@ class Trial:
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """Distance of each amplitude from its null in each set, (sets, amplitudes)."""
+    """Return the distance of each amplitude from its null in each set, (sets, amplitudes)."""
     nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
 
 def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
-    """The trials of the effects by shape and size, with columns numbered from ``first``.
+    """Make the trials of the effects by shape and size, with columns numbered from ``first``.
 
     The same amplitudes at the same shape may be tried at two sizes, because the change by a large effect need
     not be a multiple of the change by a small one.
@@ -93,7 +99,7 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
 
 class Secants:
-    """Cached changes of the windows by trials, at a given model.
+    """Compute and cache how trials change the windows at a given model.
 
     Attributes:
         free_terms: orthonormal basis (n, k) of the free terms of each window.
@@ -109,7 +115,7 @@ class Secants:
         self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
 
     def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
-        """The changes (n,), µm, of each window by each set of each trial."""
+        """Return the changes (n,), µm, that each set of each trial makes in each window."""
         rows = []
         for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
             key = effect.name, *values.items()

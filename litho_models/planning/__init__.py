@@ -1,1 +1,1 @@
-"""Plan the next prints and scans, which answer the open questions of a closed loop."""
+"""Plan the next prints and scans that answer the open questions of a closed loop."""

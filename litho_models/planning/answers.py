@@ -1,4 +1,4 @@
-"""What the plan says about each open question: difference, power, reason, meaning of each outcome."""
+"""State for each open question of a plan: difference, power, reason, and the meaning of each outcome."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Questi
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
 
-# Largest probability of a wrong name.
+# Threshold that corresponds to the largest allowed probability of a wrong name.
 Z_DECIDED = float(norm.isf(CONFIRM_P))
-# Share of a per-scan term's variance that differs between prints if the printer is the cause.
+# If the printer is the cause, this share of a per-scan term's variance differs between prints.
 PRINT_SHARE = 0.9
 ENOUGH = 0.95
 # Below this power no allowed experiment counts as separating the rivals.
@@ -28,11 +28,11 @@ MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Power with ``prints`` prints like those of the contrast.
+    """Return the power with ``prints`` prints like those of the contrast.
 
-    The difference of two squared errors has the squared distance as its mean. Its variance comes from the
-    noise along the distance, and from the distance itself, which varies between prints by the question's
-    ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
+    The difference of two squared errors has the squared distance as its mean. The variance of this difference
+    comes from the noise along the distance, and from the distance itself, which varies between prints by the
+    question's ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -42,11 +42,12 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
 
 
 def of_repeats(prints: int, scans: int) -> float:
-    """Power of remounted and rescanned prints to attribute a per-scan term to printer or microscope.
+    """Return the power of remounted and rescanned prints to attribute a per-scan term to printer or
+    microscope.
 
-    The test is the F of an analysis of variance. The printer is the cause if scans of one print agree more
-    than chance allows (p <= 0.005); the microscope is the cause if they agree less than a printer's effect
-    allows (p <= 0.005). The power is the smaller of the two.
+    The test is the F test of an analysis of variance. The printer is the cause if scans of one print agree
+    more than chance allows (p <= 0.005). The microscope is the cause if they agree less than a printer's
+    effect allows (p <= 0.005). The smaller of the two powers is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -58,7 +59,9 @@ def of_repeats(prints: int, scans: int) -> float:
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
-    """Power to tell written from scanned lines in a turned scan, where they lie along different axes."""
+    """Return the power to distinguish written from scanned lines in a turned scan, where they lie along
+    different axes.
+    """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
     own_um2 = float(grid[1:, 0].mean()) / size_px * 1e-6
@@ -68,22 +71,23 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 
 def prints_needed(powers: Sequence[float]) -> int | None:
-    """Smallest number of prints with enough power; None if no tested number has it."""
+    """Return the smallest number of prints with enough power; None if no tested number has it."""
     found = np.flatnonzero(np.array(powers) >= ENOUGH)
     return int(found[0]) + 1 if len(found) else None
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Significance of a gain, in standard deviations of noise, after allowing for the model's own error.
+    """Return the significance of a gain, in standard deviations of noise, after an allowance for the model's
+    own error.
 
-    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. If A is true
-    except for noise n and an error e of the form that both share, prints show y = A + e + n, and the
-    difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise averages
-    out over prints, but e recurs in every print of similar texture. The angle between e and D is unknown. As
-    |<D, e>| <= |D| |e| (Cauchy and Schwarz), up to 2 |D| |e| of a difference is inconclusive, and no number
-    of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without it the gain would
-    be |D|², so a deviation from |D|² beyond noise also counts as an error. The larger of the two allowances
-    is used.
+    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose A is
+    true except for noise n and an error e of the form that both rivals share. Prints then show y = A + e + n,
+    and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise
+    averages out over prints, but e recurs in every print of similar texture. The angle between e and D is
+    unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), up to 2 |D| |e| of a difference is inconclusive, and
+    no number of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without it the
+    gain would be |D|². A deviation from |D|² beyond noise therefore also counts as an error. The larger of
+    the two allowances is used.
 
     Args:
         gain: squared error of one rival minus that of the other; if negative, it favours the other.
@@ -102,7 +106,8 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
-# Draws of the rivals' parameters within their uncertainty, because a difference may depend on one of them.
+# Number of draws of the rivals' parameters within their uncertainty, because a difference may depend on a
+# parameter.
 DRAWS = 8
 _HOPELESS: Status = "no experiment separates"
 
@@ -114,7 +119,9 @@ def of_rivals(
     random: Sequence[PlannedPrint],
     prints: int,
 ) -> PlannedQuestion:
-    """Plan a question whose rivals are models, with the planned prints and with as many random layouts."""
+    """Plan a question whose rivals are models, with the planned prints and with equally many random
+    layouts.
+    """
     question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
@@ -150,7 +157,7 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Unordered pairs, each in the direction with less power, averaged over the draws."""
+    """Return the unordered pairs, each in the direction with less power, averaged over the draws."""
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
     for _ in range(DRAWS):
@@ -176,7 +183,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
 def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
-    """Plan a question that the way of scanning answers, whatever is printed."""
+    """Plan a question that depends on how prints are scanned, whatever is printed."""
     if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
         return _planned(

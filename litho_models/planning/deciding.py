@@ -1,10 +1,10 @@
-"""Decide with new prints the open questions of a first round, which were declared beforehand.
+"""Use new prints to decide the open questions that a first round declared beforehand.
 
-Every rival is fitted to all prints, old and new, and judged on the new ones alone. The difference of two
-squared errors, minus an allowance for the model's own error, is compared with its standard deviation. This
-comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of one print share its
-roughness, so their blocks are added first. A rival is excluded if another is better with p <= 0.005 and by 1
-% of its squared error. A name is given if one rival is left.
+Every rival is fitted to all prints, old and new, and judged only on the new prints. The difference of two
+squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
+standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
+one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
+better with p <= 0.005 and by 1 % of its squared error. A name is given if one rival remains.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def decide(
     new: Sequence[PrintedScan],
     report: Callable[[str], None] = lambda message: None,
 ) -> list[Decision]:
-    """Answer every declared question that scans can answer.
+    """Return the answer every declared question that scans can answer.
 
     Args:
         closed: the loop with the questions; ``new``: scans that it has not seen.
@@ -63,7 +63,7 @@ def decide(
 
 @dataclass(frozen=True)
 class Judge:
-    """New scans, together with the scans that a model was fitted to.
+    """New scans, together with the scans to which a model was fitted.
 
     Attributes:
         twin: the corrected model with common strengths; ``study``: the study that it was fitted to.
@@ -75,7 +75,7 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Fit every rival, and a model without any of them, to all scans, and judge them on the new ones."""
+        """Fit every rival, and a model without any of them, to all scans, and judge them on the new scans."""
         twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
@@ -88,7 +88,7 @@ class Judge:
         return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
-        """Analysis of variance of a per-scan term, between prints against between repeats."""
+        """Compare the variance of a per-scan term between prints with its variance between repeats."""
         own = terms_of_effect(question.name)
         scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
         by_print: dict[str, list[np.ndarray]] = {}
@@ -151,7 +151,7 @@ def compared(
 ) -> Decision:
     """Judge the answers to a question by their residuals on the new scans, maps (y, x) in nm."""
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
-    # As in the loop, a smaller difference may come from effects outside all rivals.
+    # As in the loop, a smaller difference may come from effects that are not among the rivals.
     least = {
         name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
         for name, own in left_nm.items()
@@ -191,7 +191,7 @@ def _compare(
         name = scan.stored.print_id
         by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
-    # The mean over blocks is the result of a print; the spread about it is noise.
+    # The mean over blocks is the result of a print; the spread about this mean is noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
     sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
     form = pixels * (question.form_nm or 0.0) ** 2
@@ -210,7 +210,7 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
-    """The remaining owners: those that the scans support."""
+    """Return the owners that the scans still support."""
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
 
@@ -221,7 +221,7 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """The decision on a question; by default it is decided if one answer is left."""
+    """Make the decision on a question; by default it is decided if one answer remains."""
     return Decision(
         question=question.name,
         kind=question.kind,

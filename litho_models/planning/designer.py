@@ -25,19 +25,21 @@ WORDS = {
 _MOST_EXTRAS = 2
 # A further scan is planned if it separates rivals this many times as well.
 _WORTH = 1.3
-# A lower dose keeps every exposure in the range that the models know; a higher one would not.
+# A lower dose keeps every exposure in the range that the models know, unlike a higher dose.
 SECOND_DOSE = 0.8
-# Separation, in standard deviations, below which a layout does not show the difference.
+# Below this separation, in standard deviations, a layout does not show the difference.
 _NOTHING = 0.3
-# Registration refuses layouts with repeats above 0.9; the limit is lower because prints are less clear.
+# Registration refuses layouts whose repeats exceed 0.9; the limit here is lower because prints are less
+# clear.
 _MOST_REPEATING = 0.7
 
 
 class Chosen(NamedTuple):
-    """Ways to print and scan, for one question or for all.
+    """The ways to print and scan for one question or for all questions.
 
-    ``ways``: scans of each print; ``places``, ``doses``: of the prints in turn, places in the write field;
-    ``tried``: separation in standard deviations by one plain scan, and with each other way added.
+    ``ways`` are the scans of each print. ``places`` (in the write field) and ``doses`` belong to the prints
+    in turn. ``tried`` is the separation, in standard deviations, by one plain scan and with each other way
+    added.
     """
 
     ways: tuple[Way, ...]
@@ -73,7 +75,7 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 
 def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
-    """Combine the choices for all questions; ``asked``: ways for questions that need no layout."""
+    """Combine the choices for all questions; ``asked`` contains ways for questions that need no layout."""
     ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
     places = max((one.places for one in choices), key=len, default=("centre",))
     return Chosen(tuple(ways), places, max((one.doses for one in choices), key=len, default=(1.0,)), {})
@@ -95,7 +97,7 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Optimise tiles for the questions in turn; returns soft levels, and the start of each tile.
+    """Optimise tiles for the questions in turn; return soft levels, and the start of each tile.
 
     Args:
         kept: folder of finished tiles; tiles of an interrupted run are reused.
@@ -121,6 +123,8 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """How closely a layout repeats itself, as registration judges it; 1: another shift fits equally well."""
+    """Return how closely a layout repeats itself, as registration judges it; at 1, another shift fits equally
+    well.
+    """
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

@@ -1,4 +1,6 @@
-"""Write the plan as a folder: a dataset without its scans, and sheets for printer and microscope."""
+"""Write the plan as a folder: a dataset without its scans, and instruction sheets for printer and
+microscope.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,7 @@ _REFERENCES = {
     "steps": "height against level; the microscope's gain on a step standard",
     "grating": "scales and unevenness of the scanner, and the tip",
 }
-# Their descriptions for the printer.
+# Descriptions of the references for the printer.
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -57,7 +59,7 @@ _LADDER_PX = 5 * _TREAD_PX
 def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
-    """Rows of the table, and the layout of each row."""
+    """Return the rows of the table, and the layout of each row."""
     size_px = len(planned[0].level)
     # A stair looks the same when shifted, so it gets a frame if there is room.
     ladder = limits.random(size_px, seed + 13)

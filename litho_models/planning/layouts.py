@@ -1,8 +1,8 @@
 """Optimise layouts that the rivals print most differently.
 
 A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and follows the
-gradient of the rivals' separation. It is low-passed and clipped in every step, so it stays similar to the
-layouts that the models know.
+gradient of the rivals' separation. The tile is low-passed and clipped in every step, so it stays similar to
+the layouts that the models know.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Models do not know levels that are rarer than this in earlier prints.
+# Levels that are rarer than this in earlier prints are unknown to the models.
 _RARE = 1e-3
-# Allowed distance of mean and spread of the levels from those of earlier prints.
+# Allowed distance between the mean and spread of the levels and those of earlier prints.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 
@@ -46,7 +46,9 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Allow levels with a share of a thousandth, and structure no finer than in earlier prints."""
+        """Allow levels with a share of at least a thousandth, and structure no finer than in earlier
+        prints.
+        """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
         known = levels[share >= _RARE].tolist()
@@ -55,24 +57,24 @@ class Limits:
         return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
-        """The printable soft levels (y, x) nearest to free ones."""
+        """Return the printable soft levels (y, x) nearest to unrestricted values."""
         y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
-        """Round to the levels for the printer, uint8."""
+        """Round soft levels to levels for the printer, uint8."""
         span = self.highest - self.lowest
         return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
 
     def price(self, soft: Tensor) -> Tensor:
-        """Penalty for levels whose mean or spread is far from that of earlier prints."""
+        """Return a penalty for levels whose mean or spread is far from that of earlier prints."""
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
-        """A random layout, (size, size) whole levels; ``finest``: its cut-off as a share of the largest
-        one.
+        """Make a random layout, (size, size) whole levels; ``finest`` is its cut-off as a share of the
+        largest cut-off.
         """
         level = random_layout(
             (size_px, size_px),
@@ -86,7 +88,7 @@ class Limits:
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Named layouts to start from, (size, size) levels.
+    """Yield the layouts to start from, with their names, (size, size) levels.
 
     Patterns get a random frame, a fifth of the side wide, because scans of periodic patterns cannot be
     registered.
@@ -115,7 +117,9 @@ def score(
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
 ) -> float:
-    """Separation of the nearest pair by a print of this layout at each dose, in standard deviations."""
+    """Return the separation of the nearest pair, in standard deviations, by a print of this layout at each
+    dose.
+    """
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
 
@@ -129,7 +133,7 @@ def climb(
     place: Place = "centre",
     steps: int = STEPS,
 ) -> np.ndarray:
-    """Soft levels (y, x) after gradient ascent from ``start``."""
+    """Return the soft levels (y, x) after gradient ascent from ``start``."""
     free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
@@ -139,10 +143,10 @@ def climb(
         if fresh:
             refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
         apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
-        # The separation is exact only if the rivals are refitted to this layout.
+        # The separation is exact only if the rivals have been refitted to this layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
-        # A soft minimum over pairs; with the hard one the ascent would alternate between two pairs.
+        # This is a soft minimum over pairs; with a hard minimum the ascent would alternate between two pairs.
         climber.zero_grad()
         (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()
@@ -158,5 +162,5 @@ def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Lim
 
 
 def as_tensor(level: np.ndarray) -> Tensor:
-    """Levels for a planned print."""
+    """Convert the levels of a planned print to a tensor."""
     return torch.from_numpy(level.astype(np.float32))

@@ -1,7 +1,8 @@
-"""List the open questions of a closed loop, with everything that the plan of an experiment needs.
+"""List the open questions of a closed loop, with everything that is needed to plan an experiment.
 
-Effects that look the same become rivals: the corrected model with each of them in turn, refitted to all
-scans. An effect of unknown owner becomes two rivals: one turns with the print, the other with the scan.
+Effects that look the same become rivals: each of them in turn is added to the corrected model, which is
+refitted to all scans. An effect of unknown owner becomes two rivals: one turns with the print, the other with
+the scan.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def open_questions(
     result: CloseLoop,
     report: Callable[[str], None] = lambda message: None,
 ) -> OpenQuestions:
-    """All open questions with fitted rivals, the most valuable first."""
+    """Return all open questions with fitted rivals, the most valuable question first."""
     asking = _Asking(closed, report)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = [scan.stored for scan in closed.study.scans]
@@ -70,7 +71,7 @@ def open_questions(
 
 
 def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
-    """The frequency below which most of the power of the layouts lies, cycles/µm."""
+    """Return the frequency below which most of the power of the layouts lies, cycles/µm."""
     first, layouts = scans[0], [scan.mask_level for scan in scans]
     if min(first.shape) < _SMALLEST_PX:
         return 0.05 / first.pitch_um
@@ -79,7 +80,7 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 
 
 class _Asking:
-    """Makes the questions with rivals about one closed loop."""
+    """Make the questions with rivals about one closed loop."""
 
     def __init__(self, closed: Closed, report: Callable[[str], None]):
         self.closed, self.study, self.report = closed, closed.study, report
@@ -89,7 +90,7 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """The question which effect of a set, or which owner, is right; None if nothing is open."""
+        """Ask which effect of a set, or which owner, is right; return None if nothing is open."""
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
@@ -106,7 +107,7 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """The question which of the significant but unconfirmed effects, if any, explains the residual."""
+        """Ask which of the significant but unconfirmed effects, if any, explains the residual."""
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
@@ -120,7 +121,8 @@ class _Asking:
             return None
         twins = [_with(self.twin, one) for one in standing]
         rivals = self._rivals(names, twins)
-        # The loop has estimated the error of the form without them, which applies to them too.
+        # The loop has estimated the error of the form without these effects, and the estimate applies to them
+        # too.
         learner = Learner(self.study, self.maps)
         fitted = [rival.twin(self.twin.alone()) for rival in rivals]
         rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
@@ -154,7 +156,8 @@ class _Asking:
         return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
 
     def _spread(self, name: str) -> float:
-        """Variation of the evidence for an effect over scans, relative to its mean, beyond noise.
+        """Return the variation of the evidence for an effect over scans beyond noise, relative to the mean
+        evidence.
 
         Let a be the multiple of the change d that fits a scan best. The difference of the scan's squared
         errors is |d|² (2 a - 1) plus noise, so it varies by twice the spread of a. Differences between groups
@@ -168,7 +171,7 @@ class _Asking:
             if size:
                 multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
                 own.append(self.noise.along(change) ** 2 / size)
-        # A robust spread, because a scan may have a defect.
+        # The spread is robust, because a scan may have a defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
@@ -178,7 +181,8 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Possible owners of an effect: that of the catalogue, or both if scans of one orientation cannot tell.
+    """Return the possible owners of an effect: the catalogue's owner, or both if scans of one orientation
+    cannot distinguish them.
 
     A tip that is sharper along one axis looks like a print with wider flanks along that axis.
     """
@@ -187,7 +191,7 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
 
 
 def _of_single_scans(result: CloseLoop) -> list[Question]:
-    """Questions about per-scan terms of unknown owner, and about line offsets."""
+    """Ask about per-scan terms of unknown owner, and about line offsets."""
     return [
         _question(
             "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
@@ -200,7 +204,7 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
-    """A question about effects, with its text."""
+    """Return a question about effects, with its text."""
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":
         text = "offsets of lines: written or scanned"
@@ -215,7 +219,9 @@ def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) ->
 
 
 def _missing_facts(closed: Closed) -> dict[str, str]:
-    """Effects that could not be tested because a fact about the prints is missing, with reasons."""
+    """Return the effects that could not be tested because a fact about the prints is missing, with
+    reasons.
+    """
     reasons = {name: why for name, why in closed.untestable.items() if name in CATALOGUE}
     if "field_um" not in (closed.study.scans[0].stored.write or {}):
         reasons = (

@@ -1,4 +1,4 @@
-"""``open_questions.json``: the open questions of a closed loop, from which experiments are planned.
+"""The open questions of a closed loop, ``open_questions.json``, from which experiments are planned.
 
 Rivals are fitted from the same starting points, because the base has more than one optimum: an almost
 straight projection and a steep one are different optima. Two equivalent effects fitted from different starts
@@ -32,22 +32,22 @@ _TILE_PX = 64
 
 
 class NoiseSpectrum(Record):
-    """Mean power of tiles of residuals, nm² per pixel of noise variance.
+    """The mean power of tiles of residuals, nm² per pixel of noise variance.
 
-    ``power_nm2``: (n, n) at the frequencies of ``np.fft.fft2`` of a tile; its mean is the variance of a
-    pixel.
+    ``power_nm2`` has shape (n, n), at the frequencies of ``np.fft.fft2`` of a tile; its mean is the variance
+    of a pixel.
     """
 
     power_nm2: list[list[float]]
 
     def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Power at the frequencies of ``np.fft.fft2`` of a map of this shape, nm²."""
+        """Return the power at the frequencies of ``np.fft.fft2`` for a map of this shape, nm²."""
         power = np.array(self.power_nm2)
         at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
         return map_coordinates(power, at, order=1, mode="grid-wrap")
 
     def along(self, change: np.ndarray) -> float:
-        """Standard deviation of the noise projected onto a change (y, x) of the height, nm.
+        """Return the standard deviation of the noise projected onto a change (y, x) of the height, nm.
 
         The projection is the sum over pixels of noise times change, divided by the norm of the change.
         """
@@ -56,9 +56,10 @@ class NoiseSpectrum(Record):
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Measured minus predicted height (y, x), nm, away from the edge and without the scan's free terms.
+    """Return measured minus predicted heights (y, x), nm, away from the edge and without the scan's free
+    terms.
 
-    NaN where not measured.
+    Pixels that were not measured are NaN.
     """
     border = sample_border_px(min(scan.stored.shape))
     inner = (slice(border, -border),) * 2
@@ -68,7 +69,7 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 
 
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
-    """Noise spectrum of maps of ``left_nm``, from fully measured tiles."""
+    """Compute the noise spectrum of maps of ``left_nm`` from fully measured tiles."""
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
     window /= np.sqrt((window**2).mean())
@@ -107,11 +108,13 @@ class Rival(Record):
 
     @property
     def name(self) -> str:
-        """The answer in words."""
+        """Return the answer in words."""
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """The model, whose effect turns with the print or with the scan; ``bare``: its base alone."""
+        """Return the model, whose effect turns with the print or with the scan; ``bare`` is its base
+        alone.
+        """
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
         frames: dict[Owner, Frame] = {"microscope": "scan", "printer": "print"}
@@ -142,8 +145,8 @@ class Question(Record):
 class OpenQuestions(Result):
     """``open_questions.json``: the open questions, and the noise for their decision.
 
-    ``level_share``: share of each level in earlier layouts; ``cutoff_per_um``: their finest structure,
-    cycles/µm.
+    ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` their finest
+    structure, cycles/µm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"

@@ -1,4 +1,4 @@
-"""``plan.json``, schema ``litho-models/next-print/2``."""
+"""The record of a plan, ``plan.json`` (schema ``litho-models/next-print/2``)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One planned scan; ``field_x_um``, ``field_y_um``: position in the write field; ``dose``: dose of
-    its print.
+    """One planned scan; ``field_x_um`` and ``field_y_um`` are its position in the write field, ``dose`` is
+    the dose of its print.
     """
 
     id: str
@@ -34,8 +34,8 @@ class PlannedScan(Record):
 
 
 class PlannedPair(Record):
-    """Two rivals, the difference of their refitted predictions on the planned prints, and its noise, nm
-    rms.
+    """Two rivals, the difference of their refitted predictions on the planned prints, and the noise of this
+    difference, nm rms.
     """
 
     rivals: tuple[str, str]
@@ -45,12 +45,12 @@ class PlannedPair(Record):
 
 
 class PlannedQuestion(Record):
-    """An open question with its place in the plan.
+    """An open question and how the plan answers it.
 
-    ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: the same with random
-    layouts and the same scans; ``random_difference_nm``: smallest difference of any pair there.
-    ``prints_needed``: number of prints for a power of 0.95. ``form_nm``: upper bound of the error of the
-    model's own form, None if unknown.
+    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is the same for
+    random layouts with the same scans, and ``random_difference_nm`` the smallest difference of any pair on
+    them. ``prints_needed`` is the number of prints for a power of 0.95. ``form_nm`` is an upper bound of the
+    error of the model's own form, None if unknown.
     """
 
     name: str
@@ -71,7 +71,9 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan: prints, scans and the questions that they decide; ``settings``: settings of the user."""
+    """A plan: the prints, the scans, and the questions that they decide; ``settings`` are the settings of the
+    user.
+    """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"

@@ -1,9 +1,9 @@
-"""Separation of rivals on planned scans: the difference after a refit, relative to the noise.
+"""Compute the separation of rivals on planned scans: their difference after a refit, relative to the noise.
 
 The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
-the nearest prediction of the other. As neither model is known to be true, the smaller distance of the two
+the nearest prediction of the other. Neither model is known to be true, so the smaller distance of the two
 directions counts (a simple form of the symmetric criterion of Harman and Müller, arXiv:1709.10320). Every
-scan has its own datum, tilt, bow, gain and affine registration. The refitted model stays consistent with
+scan has its own datum, tilt, bow, gain and affine registration. The refitted model must stay consistent with
 earlier prints and within the ranges of its parameters.
 """
 
@@ -37,10 +37,11 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made, as in the table of the plan.
+    """How one scan is made, as the table of the plan states it.
 
-    ``turned_deg``: angle of the print under the microscope; ``direction``: -1 for the retrace; ``tip``: 2 for
-    a second, sharp tip; ``pixel_size``: relative to earlier scans, with the same time per pixel.
+    ``turned_deg`` is the angle of the print under the microscope, ``direction`` -1 for the retrace, ``tip`` 2
+    for a second, sharp tip, and ``pixel_size`` the size relative to earlier scans, with the same time per
+    pixel.
     """
 
     turned_deg: int = 0
@@ -53,8 +54,8 @@ class Way:
 class PlannedPrint:
     """One printed field and its scans.
 
-    ``level``: (y, x), whole or soft levels; ``place``: position in the write field; ``order``: -0.5 first,
-    0.5 last; ``dose``: relative to earlier prints.
+    ``level`` has shape (y, x), whole or soft levels; ``place`` is the position in the write field, ``order``
+    runs from -0.5 (first) to 0.5 (last), and ``dose`` is relative to earlier prints.
     """
 
     level: Tensor
@@ -74,13 +75,15 @@ class Printing:
     write_field_um: float | None = None
 
     def reach_um(self, printed: PlannedPrint) -> float:
-        """Largest distance from the centre of a print to the centre of the write field, along both axes."""
+        """Return the largest distance from the centre of a print to the centre of the write field, along both
+        axes.
+        """
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
         return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
 
     def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
-        """The context of a planned scan, for effects."""
+        """Return the context of a planned scan, for effects."""
         reach_um = self.reach_um(printed)
         return FieldContext(
             layout_um,
@@ -98,17 +101,17 @@ class Printing:
         )
 
     def predict(self, chain: EffectChain, printed: PlannedPrint, way: Way) -> Tensor:
-        """Height (y, x), µm, that this scan would show."""
+        """Predict the height (y, x), µm, that this scan would show."""
         layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
         return chain(layout_um, self.context(layout_um, printed, way))[0, 0]
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A directed pair of rivals on some prints; each figure has shape (prints,).
+    """A directed pair of rivals on some prints; each quantity has shape (prints,).
 
-    ``squares_um2``: squared distance over all pixels and scans; ``sd_um2``: standard deviation, by noise, of
-    the difference of the two squared errors; ``pixels``: number of pixels of all scans.
+    ``squares_um2`` is the squared distance over all pixels and scans, ``sd_um2`` the standard deviation, by
+    noise, of the difference of the two squared errors, and ``pixels`` the number of pixels of all scans.
     """
 
     squares_um2: Tensor
@@ -117,22 +120,22 @@ class Contrast:
 
     @property
     def rms_nm(self) -> float:
-        """Root of the mean squared distance over pixels."""
+        """Return the root of the mean squared distance over pixels."""
         return NM_PER_UM * float((self.squares_um2.sum() / self.pixels.sum()).sqrt())
 
     @property
     def noise_nm(self) -> float:
-        """Standard deviation of the noise along the difference, per pixel."""
+        """Return the standard deviation of the noise along the difference, per pixel."""
         return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
 
     def separation(self, spread: float) -> Tensor:
-        """Distance in standard deviations, differentiable; ``spread``: of a question."""
+        """Return the distance in standard deviations, differentiable; ``spread`` is that of a question."""
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
 
 
 class Rivalry:
-    """The rivals of one question, and what they predict of planned prints.
+    """The rivals of one question, and what they predict for planned prints.
 
     Args:
         question: a question with at least two rivals.
@@ -146,16 +149,16 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # The rivals as possible truths; refits start from ``twins``.
+        # These are the rivals as possible truths; refits start from ``twins``.
         self.true = self.chains = [_chain(twin) for twin in self.twins]
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Directed pairs: (the true one, the one refitted to it)."""
+        """Return the directed pairs: the true model, and the model refitted to it."""
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
-        """Draw the rivals' true parameters within the uncertainty after earlier prints."""
+        """Draw the rivals' true parameters within the uncertainty that remains after earlier prints."""
         other = copy.copy(self)
         other.true = []
         for twin, rival in zip(self.twins, self.question.rivals, strict=True):
@@ -200,7 +203,7 @@ class Rivalry:
         return [self._linearise(twin, prints) for twin in self.twins]
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
-        """The contrast of every directed pair on these prints; differentiable in the levels."""
+        """Return the contrast of every directed pair on these prints, differentiable in the levels."""
         true = [self._predict(chain, prints) for chain in self.true]
         return [
             self._contrast(true[first], self._predict(partner, prints), prints)
@@ -208,7 +211,9 @@ class Rivalry:
         ]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Separation of each directed pair (pairs,), in standard deviations; differentiable in the levels."""
+        """Return the separation of each directed pair (pairs,), in standard deviations; differentiable in the
+        levels.
+        """
         return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
@@ -220,8 +225,8 @@ class Rivalry:
             squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
             for _ in printed.ways:
                 right, refitted = next(scans)
-                # Scan terms of the refitted model; with the true model's gain term, the refit could shrink to
-                # zero.
+                # The scan terms are those of the refitted model. With the gain term of the true model, the
+                # refit could shrink to zero.
                 basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
                 inner = _inner(right - refitted)
                 flat = inner.reshape(-1)
@@ -267,5 +272,5 @@ def _flat(field: Tensor) -> np.ndarray:
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Orthonormal basis (n, k) of a scan's free terms on the inner pixels."""
+    """Return the orthonormal basis (n, k) of a scan's free terms on the inner pixels."""
     return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)

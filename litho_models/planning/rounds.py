@@ -1,4 +1,4 @@
-"""Run a loop with its open questions, and decide these with later prints of the same printer."""
+"""Run a loop, write its open questions, and decide them with later prints of the same printer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def close_loop(
     report: Callable[[str], None] = lambda message: None,
     **settings: Any,
 ) -> CloseLoop:
-    """Close the loop on a store by ``loop.run.close_loop``, and write its open questions beside the result.
+    """Close the loop on a store by ``loop.run.close_loop``, and write its open questions with the result.
 
     Args:
         new_prints: further stores of the same printer. They decide the open questions (see ``deciding``) and
@@ -49,7 +49,7 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Read the scans of a further store; check that printer and orientation match the card.
+    """Read the scans of a further store, and check that printer and orientation match the card.
 
     Raises:
         InputError: another printer, or another orientation.
@@ -67,7 +67,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             f"prints of {store.path}",
             got=f"a plan for dataset {planned[:12]}…",
             wanted=f"a plan for {first.path}, {first.sha256[:12]}…",
-            hint="they were printed for another printer's questions",
+            hint="these prints answer another printer's questions",
         )
     scans = store.scans()
     for scan in scans:
@@ -77,7 +77,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             raise InputError(
                 f"scan {scan.id} of {store.path}",
                 got=f"turned by {90 * scan.quarter_turns}° on its layout, {90 * stated}° in its card",
-                wanted="what the scan shows",
+                wanted="the turn that the scan shows",
                 hint="add the column turned_deg to the table of the card, and build again",
             )
     return scans

@@ -43,7 +43,8 @@ def next_print(
     layouts: Literal["optimised", "random"] = "optimised",
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
-    """Plan prints and scans that decide the open questions of a closed loop; None if nothing is open.
+    """Plan prints and scans that decide the open questions of a closed loop; return None if no question is
+    open.
 
     Args:
         loop: folder of a closed loop.
@@ -89,7 +90,7 @@ def next_print(
         chosen = together(choices, turned)
         count = _TILES if size_px > tile_px else prints
         tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
-        # Finished tiles of an interrupted run.
+        # The finished tiles of an interrupted run are stored here.
         cache = Path(f"{out}-cache")
         if rivalries and layouts == "optimised":
             kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]

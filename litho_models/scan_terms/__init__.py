@@ -1,4 +1,4 @@
-"""Terms that a scan adds to the height, and their removal by fits to pixels that are not scored."""
+"""The terms that a scan adds to the height; they are fitted to pixels that are not scored, and removed."""
 
 from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.cross_fit import CrossFit, cross_fit, fitted_terms, freed_um, least_squares

@@ -1,8 +1,8 @@
 """The smooth background that all scans of one microscope share.
 
-Levelling by planes leaves, for example, a bow. The part of it that is the same in every scan is learned from
-the training scans and added to predictions of *measured* maps. It does not belong to the printer and enters
-no design.
+Levelling by planes leaves, for example, a bow in every scan. The part of the bow that is the same in every
+scan is learned from the training scans and added to predictions of *measured* maps. This background does not
+belong to the printer and enters no design.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scan_terms.policies import POLICIES
 from litho_models.scan_terms.term import FloatMap, smooth_shapes
 
-# Relative tolerance of the field size. A bow from a field 1 % larger or smaller is wrong by 2 %.
+# Relative tolerance of the field size. A bow learned on a field 1 % larger or smaller is wrong by 2 %.
 _SAME_SIZE = 0.01
 
 
 class Background(Record):
-    """Mean over ``scans`` training scans of the coefficients of x, y, x², xy, y², nm.
+    """Mean coefficients of x, y, x², xy and y² over ``scans`` training scans, nm.
 
     x and y run from -1 to 1 over a field of ``field_um`` (y, x). Each term has zero mean, so a background
-    moves no datum.
+    changes no datum.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -41,22 +41,22 @@ class Background(Record):
     scans: int
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Whether the scan's field has the size on which the background was learned."""
+        """Return whether the scan's field has the size on which the background was learned."""
         return is_of_size(scan, self.field_um)
 
     def map_um(self, shape: tuple[int, int]) -> FloatMap:
-        """The background on a field of ``shape`` (ny, nx), µm."""
+        """Return the background on a field of ``shape`` (ny, nx), µm."""
         coefficients = (self.x_nm, self.y_nm, self.xx_nm, self.xy_nm, self.yy_nm)
         return np.tensordot(coefficients, smooth_shapes(shape), axes=1) / NM_PER_UM
 
 
 def field_um(scan: PrintedScan) -> tuple[float, float]:
-    """Size (y, x) of a scan's field, µm."""
+    """Return the size (y, x) of a scan's field, µm."""
     return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um
 
 
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
-    """Whether a scan's field has this size (y, x), µm."""
+    """Return whether a scan's field has this size (y, x), µm."""
     return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
 
 

@@ -1,9 +1,9 @@
-"""Divide the pixels of a scan into those for fitting its terms and those that are scored.
+"""Divide the pixels of a scan into those to which terms are fitted and those that are scored.
 
-Terms fitted to the scored pixels would flatter the model. Smooth terms are fitted to one half of a
-checkerboard and applied to the other. The offset of a line comes from few pixels, whose roughness correlates
-with that of their neighbours (still by 0.2 at 32 px along x). Line offsets are therefore fitted on the other
-side of the scan, beyond a gap.
+Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are fitted to one
+half of a checkerboard and subtracted from the other. The offset of a line comes from few pixels, whose
+roughness correlates with that of their neighbours (still by 0.2 at 32 px along x). Line offsets are therefore
+fitted on the other side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BoolMap = NDArray[np.bool_]
 
 
 class Blocks(NamedTuple):
-    """Geometry of the two halves, which every result records.
+    """The geometry of the two halves, which every result records.
 
     Attributes:
         block_px: side of a block of the checkerboard.
@@ -47,7 +47,7 @@ class Half(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A part of the scan to score, and for each axis the pixels for fitting line offsets."""
+    """A part of the scan to score and, for each axis, the pixels to which line offsets are fitted."""
 
     score: BoolMap
     other_side: dict[int, BoolMap]
@@ -55,7 +55,7 @@ class Cell(NamedTuple):
 
 @lru_cache(maxsize=8)
 def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
-    """Checkerboard of square blocks as two halves.
+    """Divide the scan into the two halves of a checkerboard of square blocks.
 
     Raises:
         InputError: blocks that are too small for the buffer.
@@ -73,7 +73,8 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
-    """Cut the scan across its lines: into halves for lines along one axis, quadrants for lines along both.
+    """Cut the scan across its lines: into halves for lines along one axis, into quadrants for lines along
+    both.
 
     Args:
         shape: (ny, nx).
@@ -93,7 +94,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
 
 
 def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
-    """Flat indices of about ``count`` used pixels (ny, nx), on a square lattice."""
+    """Return the flat indices of about ``count`` used pixels (ny, nx), on a square lattice."""
     stride = max(1, round((used.sum() / count) ** 0.5))
     lattice = np.zeros_like(used)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True

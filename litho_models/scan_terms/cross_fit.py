@@ -1,7 +1,7 @@
-"""Remove a scan's terms, fitted to pixels that are not scored.
+"""Remove a scan's terms, which are fitted to pixels that are not scored.
 
-A microscope's datum or bow says nothing about the printer, so errors may be stated without it. Every such
-error in this project comes from ``cross_fit``.
+A microscope's datum or bow says nothing about the printer, so errors may be stated without these terms.
+``cross_fit`` computes every error in this project from which such terms are removed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Residual of one scan without its terms, which are fitted to pixels that are not scored.
+    """Return the residual of one scan without its terms, which are fitted to pixels that are not scored.
 
     Args:
         height_um: measured height (ny, nx), µm; NaN allowed where not valid.
@@ -105,9 +105,9 @@ def fitted_terms(
     used: BoolMap,
     terms: Terms,
 ) -> tuple[FloatMap, FloatMap]:
-    """Fit smooth terms to all used pixels; returns coefficients (k,) and the map of the terms, (ny, nx) µm.
+    """Fit smooth terms to all used pixels; return coefficients (k,) and the map of the terms, (ny, nx) µm.
 
-    Use it for training, pictures and defects; reported errors take their terms from ``cross_fit``.
+    Use the map for training, pictures and defects; reported errors take their terms from ``cross_fit``.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
@@ -116,13 +116,15 @@ def fitted_terms(
 
 
 def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
-    """Measured minus predicted height without ``fitted_terms``, (ny, nx) µm; 0 at unused pixels."""
+    """Return the measured minus predicted height without ``fitted_terms``, (ny, nx) µm; 0 at unused
+    pixels.
+    """
     _, own = fitted_terms(height_um, prediction_um, used, terms)
     return np.where(used, height_um - prediction_um - own, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Least-squares coefficients (k, …) of ``design`` (k, n) for ``target`` (n, …)."""
+    """Return the least-squares coefficients (k, …) of ``design`` (k, n) for ``target`` (n, …)."""
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 
 

@@ -1,7 +1,7 @@
-"""Ridge regression over scans, for columns with a common strength or strengths by group.
+"""Ridge regression over scans, for columns whose strengths are common to all scans or differ by group.
 
-The inner products of residual and columns of each scan are enough. They give the strengths fitted to any
-scans and the squared error of any others.
+The regression needs only the inner products of residual and columns of each scan. From these it finds the
+strengths fitted to any scans, and the squared error of any other scans.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from litho_data.store import PrintedScan
 
 Labels = tuple[str, ...]
 ALL = "all"
-# Fewest scans of a group whose common part can be told from the parts of single scans.
+# Fewest scans of a group whose common part can be distinguished from the parts of single scans.
 FEWEST_IN_GROUP = 2
 _STATED = ("tip", "direction", "turned_deg")
 _ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
-    """The label of a scan in a grouping; empty if it has none."""
+    """Return the label of a scan in a grouping; empty if it has none."""
     if by == ALL:
         return ""
     if by in scan.groups:
@@ -37,7 +37,7 @@ def label_of(scan: PrintedScan, by: str) -> str:
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
         last, first = map(int, value.split("-"))
-        # A scan in between may be before or after the change.
+        # A scan between the two may lie before or after the change.
         return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
     if value and kind == _CHARACTER:
         return scan.id[int(value) - 1 : int(value)]
@@ -45,12 +45,12 @@ def label_of(scan: PrintedScan, by: str) -> str:
 
 
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
-    """Label of each scan by grouping, with ``all`` first.
+    """Return the label of each scan in every grouping, with ``all`` first.
 
-    Groups come from the card (print, field, tip, direction and turn of a scan), from each varying character
-    of the ids, and, with ``by_order``, from the order: before and after every possible time of a change. A
-    grouping needs at least two labels, and at least half of them with two or more scans. Of two equal
-    groupings only the first is used.
+    Groups come from the card (print, field, tip, direction and turn of a scan) and from each varying
+    character of the ids. With ``by_order`` they also come from the order: before and after every possible
+    time of a change. A grouping needs at least two labels, and at least half of them with two or more scans.
+    Of two identical groupings only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -83,7 +83,7 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Positions in the order at which something may have changed: between prints, or anywhere with two
+    """Return positions in the order at which something may have changed: between prints, or anywhere with two
     scans on each side.
     """
     orders = sorted({scan.order for scan in scans})
@@ -96,7 +96,7 @@ def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
     return orders[FEWEST_IN_GROUP : len(orders) - FEWEST_IN_GROUP + 1]
 
 
-# Added to a unit diagonal, so that equal columns can be solved for.
+# A small number added to a unit diagonal, so that the equations can be solved for equal columns.
 _ALIKE = 1e-7
 
 
@@ -117,7 +117,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Products:
-    """Inner products of the scans, and their groups.
+    """The inner products of the scans, and their groups.
 
     Attributes:
         grams: (scans, 1 + m, 1 + m), residual first, per pixel.
@@ -129,13 +129,13 @@ class Products:
 
     @classmethod
     def ungrouped(cls, grams: np.ndarray) -> Products:
-        """Inner products for columns with common strengths."""
+        """Return inner products for columns with common strengths."""
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Best strengths (columns,) for these scans, by block and label; ``scans``: indices.
+        """Return the best strengths (columns,) for the scans with these indices, by block and label.
 
-        Labels without any of these scans are absent.
+        Labels that none of these scans has are absent.
         """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
@@ -144,7 +144,7 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Mean squared residual (scans,) of these scans with the strengths of their groups.
+        """Return the mean squared residual (scans,) of these scans with the strengths of their groups.
 
         A scan whose label has no strengths is unchanged.
         """
@@ -160,7 +160,7 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Mean squared residual (scans,) of each scan, with strengths fitted without its fold."""
+        """Return the mean squared residual (scans,) of each scan, with strengths fitted without its fold."""
         left = np.empty(len(fold_of))
         for fold in np.unique(fold_of):
             own = np.flatnonzero(fold_of == fold)
@@ -171,8 +171,8 @@ class Products:
     def freed_of(self, blocks: Sequence[Block]) -> Products:
         """Project these blocks, fitted to all scans, out of the residual and the other columns.
 
-        The columns of the blocks become zero. Later fits of common strengths equal a joint fit. Later fits of
-        strengths by group equal a joint fit only if the projected part is the same in all groups.
+        The columns of the blocks become zero. Later fits of common strengths then equal a joint fit. Later
+        fits of strengths by group equal a joint fit only if the projected part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -190,7 +190,7 @@ class Products:
 
 
 class _Expanded:
-    """Normal equations with one row per strength and label.
+    """Normal equations with one row for every strength and label.
 
     Attributes:
         columns: columns of all blocks; ``rows``: rows of each block's strengths, by label.
@@ -222,7 +222,7 @@ class _Expanded:
         self._shrunk = np.array(shrunk)
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Least-squares strengths (rows, targets) for these columns, or for the residual."""
+        """Return least-squares strengths (rows, targets) for these columns, or for the residual."""
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows in self.alike:

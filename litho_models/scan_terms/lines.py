@@ -1,4 +1,4 @@
-"""Line offsets: the line of each pixel, and the offset of each line."""
+"""Find the scan line of each pixel, and the offset of each line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 def scan_line_index(
     shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
 ) -> LineIndex:
-    """Index, from 0, of the scan line (constant y in the scan's frame) under each layout pixel, (ny, nx).
+    """Return the index, from 0, of the scan line (constant y in the scan's frame) under each layout pixel,
+    (ny, nx).
 
     Args:
         shape: (ny, nx) of the layout.
@@ -37,7 +38,7 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """The axis of the lines: 1 for lines along x, 0 for a scan turned by 90 degrees."""
+    """Return the axis of the lines: 1 for lines along x, 0 for a scan turned by 90 degrees."""
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
 
@@ -45,11 +46,11 @@ def axis_along(line: LineIndex) -> int:
 def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
-    """Estimate line offsets as a variance component: best linear prediction of s_i ~ N(0, v).
+    """Estimate line offsets as a variance component: the best linear prediction of s_i ~ N(0, v).
 
     The scatter of block means within a line gives the noise of the line's mean, including correlation along
-    the line. The remaining variance of the line means is v. For equal counts this moment estimate equals
-    REML. A line without used pixels gets 0.
+    the line. The remaining variance of the line means is v. If all lines have the same count, this moment
+    estimate equals REML. A line without used pixels gets 0.
 
     Args:
         residual_um: (ny, nx), µm; ``used``: pixels to use; ``line``: line of each pixel.
@@ -66,7 +67,7 @@ def shrunk_line_offsets(
     cell = (line * block_count + block)[used]
     count = np.bincount(cell, minlength=line_count * block_count).reshape(line_count, block_count)
     total = np.bincount(cell, residual_um[used], minlength=count.size).reshape(count.shape)
-    # Blocks with few pixels (at the edge of the scan) are left out, because all blocks count equally.
+    # Blocks with few pixels (at the edge of the scan) are left out, because all blocks have equal weight.
     filled = count >= max(1, count.max() // 2)
     means = np.where(filled, total / np.maximum(count, 1), 0.0)
     blocks = filled.sum(axis=1)

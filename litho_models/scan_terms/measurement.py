@@ -1,6 +1,6 @@
-"""The measurement model: the changes by microscope, registration and levelling that scans share.
+"""The measurement model: changes by microscope, registration and levelling that scans share.
 
-A scan shows the print after levelling, with displacements by an uneven scanner, with a gain, and on a
+A scan shows the print after levelling, displaced by an uneven scanner, multiplied by a gain, and on a
 background. The parts that all scans, or all scans of a group, share are learned from training scans and
 applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model does not
 belong to the printer and enters no design.
@@ -28,7 +28,7 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that may have been fitted to whole files and subtracted: which of x, y, x², xy, y², from 1.
+# Surfaces that may have been fitted to whole files and subtracted: which of x, y, x², xy, y², counted from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -43,7 +43,8 @@ class SharedPart(Record):
     Attributes:
         what: ``background`` and displacements are sums of Legendre polynomials of x and y, -1 to 1 over the
             field, up to the total ``degree``; the gain is one relative number.
-        by: grouping; ``coefficients``: by label, in µm, or 1 for the gain. A part without any adds nothing.
+        by: grouping; ``coefficients``: by label, in µm, or 1 for the gain. A part without coefficients adds
+            nothing.
         shrinking: weight, in scans, of the prior for zero in the fit.
     """
 
@@ -55,15 +56,15 @@ class SharedPart(Record):
 
     @property
     def numbers(self) -> int:
-        """Fitted numbers."""
+        """Return the fitted numbers."""
         return sum(len(own) for own in self.coefficients.values())
 
     def of(self, scan: PrintedScan) -> list[float]:
-        """The coefficients of the scan's group; empty if it has none."""
+        """Return the coefficients of the scan's group; empty if it has none."""
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
-        """The sum of polynomials on the scan's field, (ny, nx) µm; a background has no constant."""
+        """Return the sum of polynomials on the scan's field, (ny, nx) µm; a background has no constant."""
         own = self.of(scan)
         return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
 
@@ -87,15 +88,15 @@ class MeasurementModel(Record):
 
     @property
     def numbers(self) -> int:
-        """Fitted numbers."""
+        """Return the fitted numbers."""
         return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Whether the scan's field has the size of the training fields."""
+        """Return whether the scan's field has the size of the training fields."""
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
-        """The expected scan (ny, nx) of a predicted print (ny, nx), µm.
+        """Return the map (ny, nx), µm, that the scan is expected to show for a predicted print (ny, nx), µm.
 
         For a field of another size only the levelling is applied.
         """
@@ -107,12 +108,12 @@ class MeasurementModel(Record):
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
-        """The scan without the changes that this model makes to its predicted print (ny, nx), µm."""
+        """Subtract from the scan the changes that this model makes to its predicted print (ny, nx), µm."""
         added = self.expected_um(scan, prediction_um) - prediction_um
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """The model of differences between groups: each part without its mean over the labels.
+        """Return the model of the differences between groups: each part without its mean over the labels.
 
         Gains are left out, because differences between prints may come from the printer.
         """
@@ -126,17 +127,17 @@ class MeasurementModel(Record):
         return self.model_copy(update={"parts": kept, "levelling": "none"})
 
     def background_um(self, scan: PrintedScan) -> FloatMap:
-        """The background on the scan's field, (ny, nx) µm."""
+        """Return the background on the scan's field, (ny, nx) µm."""
         backgrounds = (part for part in self._parts(scan) if part.what == "background")
         return sum((part.map_um(scan) for part in backgrounds), np.zeros(scan.shape))
 
     def _parts(self, scan: PrintedScan) -> list[SharedPart]:
-        """The parts that apply to the scan."""
+        """Return the parts that apply to the scan."""
         return [part for part in self.parts if part.of(scan)] if self.fits(scan) else []
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """A predicted print displaced by these parts, (ny, nx) µm."""
+    """Displace a predicted print by these parts, (ny, nx) µm."""
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
     if not moves:
@@ -149,7 +150,7 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """Subtract the surface that fits a field best on the usable pixels; the mean stays."""
+    """Subtract the surface that fits a field best on the usable pixels, but keep the mean."""
     if levelling == "none":
         return field
     shapes = polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
@@ -160,7 +161,7 @@ def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Flo
 
 @lru_cache(maxsize=8)
 def polynomials(shape: tuple[int, ...], degree: int) -> FloatMap:
-    """Products of Legendre polynomials of y and x, ordered by total degree, (k, ny, nx)."""
+    """Return the products of Legendre polynomials of y and x, ordered by total degree, (k, ny, nx)."""
     y, x = (legendre.legvander(np.linspace(-1, 1, n), degree).T for n in shape)
     maps = [np.outer(y[by_y], x[total - by_y]) for total in range(degree + 1) for by_y in range(total + 1)]
     found = np.stack(maps)

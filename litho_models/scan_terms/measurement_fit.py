@@ -1,4 +1,4 @@
-"""Learn the measurement model: which parts scans share, and their sizes.
+"""Learn the measurement model: which parts scans share, and how large they are.
 
 Parts are chosen by cross-validation within the given scans.
 """
@@ -29,7 +29,7 @@ from litho_models.scan_terms.measurement import (
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# Parts to try, the most likely first. A background of degree 11 varies over 9 µm in a field of 54 µm.
+# The parts to try, the most likely first. A background of degree 11 varies over 9 µm in a field of 54 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -42,7 +42,8 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights, in scans, of the prior for no difference between groups: variance within over variance between.
+# Weights, in scans, of the prior for no difference between groups: variance within groups over variance
+# between them.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part is kept if the held-out squared error falls by this many standard errors and by this share.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
@@ -52,7 +53,7 @@ _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# A part to try: its degree and grouping. A scan with its predicted print (ny, nx), µm.
+# A part to try, with its degree and grouping. A scan with its predicted print (ny, nx), µm.
 _Offer = tuple[Shared, int, Block]
 _Pair = tuple[PrintedScan, np.ndarray]
 
@@ -91,7 +92,7 @@ def learn_measurement(
 
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
-    """Inner products of all parts to try, at the current measurement model."""
+    """Return the inner products of all parts to try, at the current measurement model."""
     grams = []
     for scan, prediction in pairs:
         rows = _rows(scan, prediction, model)
@@ -148,9 +149,9 @@ def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Residual and columns (1 + m, n) at thinned pixels, without their means.
+    """Return the residual and columns (1 + m, n) at thinned pixels, without their means.
 
-    The contribution of the current parts is added back to first order. Their strengths are then fitted as a
+    The contribution of the current parts is added back to first order. The strengths are then fitted as a
     whole and shrunk only once, whatever the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
@@ -174,7 +175,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
-    """The columns of a part among the rows of a scan."""
+    """Return the columns of a part among the rows of a scan."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,
@@ -187,7 +188,9 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
-    """The levelling that brings predictions closest to the scans, after a shared bow and tilt are removed."""
+    """Choose the levelling that brings predictions closest to the scans, after a shared bow and tilt are
+    removed.
+    """
     rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
     for scan, prediction in pairs:
         at = thinned(scan.usable, _SAMPLED_PX)
@@ -205,6 +208,6 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Inner fold of each scan, dealt by a hash of its id."""
+    """Return the inner fold of each scan, chosen by a hash of its id."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])

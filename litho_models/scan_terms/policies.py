@@ -1,4 +1,4 @@
-"""The usual sets of scan terms for scores and for training, and the record of a score's protocol."""
+"""The usual sets of scan terms for scores and for training, and the record of how a score was made."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POLICIES: dict[Policy, Terms] = {
 
 
 def policy_terms(policy: str) -> Terms:
-    """The terms of a policy.
+    """Return the terms of a policy.
 
     Raises:
         InputError: no such policy.
@@ -40,22 +40,23 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """The default policy; films have no free zero height."""
+    """Return the default policy; films have no free zero height."""
     return "none" if film else "offset"
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """The default background of predictions."""
+    """Return the default background of predictions."""
     return "none" if film else "training"
 
 
 class NuisanceProtocol(Record):
-    """The terms that are removed from scans before scoring, and the pixels of their fit.
+    """The terms that are removed from scans before scoring, and the pixels to which they are fitted.
 
-    ``k``: number of smooth terms per scan, without the effective number of line offsets of ``full+rows``,
-    which depends on the prediction (``PolicyError.k``). ``background``: ``training`` if predictions include
-    the smooth background of the training scans, ``shared`` if they include the whole measurement model;
-    nothing of it is fitted to the scored scan. ``border_px``: pixels left out at the edge of a scan, none.
+    ``k`` is the number of smooth terms per scan. It excludes the effective number of line offsets of
+    ``full+rows``, which depends on the prediction (``PolicyError.k``). ``background`` is ``training`` if
+    predictions include the smooth background of the training scans, and ``shared`` if they include the whole
+    measurement model. No part of it is fitted to the scored scan. ``border_px`` is the number of pixels left
+    out at the edge of a scan, which is zero.
     """
 
     policy: Policy = "offset"
@@ -69,7 +70,7 @@ class NuisanceProtocol(Record):
 
     @classmethod
     def of_policy(cls, policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
-        """The standard protocol of a policy."""
+        """Return the standard protocol of a policy."""
         k = float(
             sum(len(term.labels) for term in chosen_terms(policy_terms(policy)) if term.maps is not None)
         )
@@ -77,7 +78,7 @@ class NuisanceProtocol(Record):
 
     @property
     def blocks(self) -> Blocks:
-        """The division into fitted and scored pixels."""
+        """Return the division into fitted and scored pixels."""
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
@@ -86,7 +87,8 @@ PINNED: Terms = frozenset({"offset", "gain"})
 
 
 def training_terms(policy: Policy, free_gain: bool = False) -> Terms:
-    """The terms of a policy that are fitted together with a model: all, except the gain unless it is free.
+    """Return the terms of a policy that are fitted together with a model: all, but the gain only if it is
+    free.
 
     Part of a scan's gain is a long-range effect of the layout, which a model cannot learn if every scan has a
     free gain.
@@ -95,7 +97,9 @@ def training_terms(policy: Policy, free_gain: bool = False) -> Terms:
 
 
 def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
-    """The same without line offsets, which average out over a scan and hardly change a small model."""
+    """Return the same terms without line offsets, which average out over a scan and hardly change a small
+    model.
+    """
     terms = training_terms(policy, free_gain)
     return terms - {term.name for term in line_terms(terms)}
 
@@ -103,9 +107,10 @@ def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """Terms that each scan adds to the model's height, float32 (ny, nx) µm, fitted to all its valid pixels.
+    """Estimate the terms that each scan adds to the model's height, float32 (ny, nx) µm, from all its valid
+    pixels.
 
-    Use it only for training; reported errors take their terms from ``cross_fit``.
+    Use the terms only for training; reported errors take their terms from ``cross_fit``.
     """
     fitted = [
         fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]

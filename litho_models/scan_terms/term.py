@@ -37,25 +37,25 @@ class TermPixels:
 
     @cached_property
     def height(self) -> FloatMap:
-        """Predicted height at the pixels minus its mean over the whole scan, (n,) µm."""
+        """Return the predicted height at the pixels minus its mean over the whole scan, (n,) µm."""
         prediction = np.asarray(self.prediction_um, np.float64)
         return self._taken(prediction) - float(prediction.mean())
 
     @cached_property
     def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Change of the predicted height per pixel along y and along x, (n,) µm each."""
+        """Return the change of the predicted height per pixel along y and along x, (n,) µm each."""
         slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
         return self._taken(slopes[0]), self._taken(slopes[1])
 
     @cached_property
     def smooth(self) -> FloatMap:
-        """``smooth_shapes`` at the pixels, (5, n)."""
+        """Return ``smooth_shapes`` at the pixels, (5, n)."""
         shapes = smooth_shapes(self.prediction_um.shape)
         return np.stack([self._taken(shape) for shape in shapes])
 
     @cached_property
     def time(self) -> FloatMap:
-        """Relative time of each pixel: 0 in the first line, 1 in the last, (n,)."""
+        """Return the relative time of each pixel, from 0 in the first line to 1 in the last, (n,)."""
         line = row_index(self.prediction_um.shape) if self.line is None else self.line
         return self._taken(line) / max(int(line.max()), 1)
 
@@ -88,14 +88,14 @@ class ScanTerm:
 
 
 def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
-    """The smooth maps of some terms, in the order of the catalogue, (k, n)."""
+    """Return the smooth maps of some terms, in the order of the catalogue, (k, n)."""
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
     count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
     return np.concatenate([np.empty((0, count)), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
-    """Names of the coefficients of ``term_maps``, with their usual units."""
+    """Return the names of the coefficients of ``term_maps``, with their usual units."""
     shown = {"µm": " (nm)", "px": " (px)", "1": ""}
     return [
         label + shown[term.unit]
@@ -106,7 +106,7 @@ def parameter_names(terms: Iterable[str]) -> list[str]:
 
 
 def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """The terms of these names, in the order of the catalogue.
+    """Return the terms of these names, in the order of the catalogue.
 
     Raises:
         InputError: a name that is not in the catalogue.
@@ -118,12 +118,12 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def line_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """The line offsets among these terms."""
+    """Return the line offsets among these terms."""
     return [term for term in chosen_terms(names) if term.lines is not None]
 
 
 def terms_of_effect(effect: str) -> Terms:
-    """The terms of an effect; empty if it is not a per-scan effect."""
+    """Return the terms of an effect; empty if it is not a per-scan effect."""
     return frozenset(term.name for term in SCAN_TERMS.values() if term.effect == effect)
 
 
@@ -143,7 +143,7 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
 
 @lru_cache(maxsize=8)
 def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
-    """x, y, x², xy, y² on -1 ... 1 over a scan (ny, nx), each of zero mean: (5, ny, nx), read-only."""
+    """Return x, y, x², xy, y² on -1 ... 1 over a scan (ny, nx), each of zero mean: (5, ny, nx), read-only."""
     ny, nx = shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     shapes = np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])
@@ -152,25 +152,27 @@ def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
 
 
 def row_index(shape: tuple[int, ...]) -> LineIndex:
-    """Row number of each pixel, (ny, nx)."""
+    """Return the row number of each pixel, (ny, nx)."""
     return np.broadcast_to(np.arange(shape[0], dtype=np.intp)[:, None], shape)
 
 
 def _drift(pixels: TermPixels) -> FloatMap:
-    """Exponential creep after the scan starts; slower creep is part of the bow."""
+    """Return the exponential creep after the scan starts; slower creep is part of the bow."""
     time = pixels.time
     ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
     return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
 
 
 def _warp(pixels: TermPixels) -> FloatMap:
-    """Changes by an affine error of the registration."""
+    """Return the changes that an affine error of the registration causes."""
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (np.ones_like(x), y, x)])
 
 
 def _distortion(pixels: TermPixels) -> FloatMap:
-    """Changes by a quadratic error of the registration, centred, so a common distortion causes no shift."""
+    """Return the changes that a quadratic error of the registration causes, centred so that a common
+    distortion causes no shift.
+    """
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
 
@@ -178,7 +180,7 @@ def _distortion(pixels: TermPixels) -> FloatMap:
 # Decay times of the two parts of a creep, in scan times; slower creep is part of the bow.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
-# In the order in which they are tested.
+# These are listed in the order in which they are tested.
 _BUILT_IN = (
     ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
     ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None]),

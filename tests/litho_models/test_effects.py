@@ -411,7 +411,7 @@ def test_what_single_scans_add_has_scan_terms_and_enters_no_model() -> None:
     assert {effect.name for effect in own} == {term.effect for term in SCAN_TERMS.values()} - {None}
     for effect in own:
         assert not effect.trials
-        with pytest.raises(InputError, match="one with a value for each scan"):
+        with pytest.raises(InputError, match="a per-scan effect"):
             effect(array, {}, context)
 
 
