@@ -1,4 +1,4 @@
-"""The interface of every model of the printer, from layout to printed height."""
+"""The interface of every model of the printer: a layout goes in, a printed height comes out."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
 SMALL_PARAMETERS = 64
 FIRST_SPOT_UM = 0.2
-"""Spot of the first printer, standard deviation: the default lengths of models are multiples of it."""
+"""Spot of the first printer, standard deviation, µm: the default lengths of models are multiples of it."""
 _RESOLVED_PX = (0.5, 10.0)
 _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Spot (standard deviation, µm) that sets default lengths for layouts of a pitch.
+    """Return the spot (standard deviation, µm) that sets the default lengths for layouts of a pitch.
 
-    It is the spot of the first printer if that is between half a pixel and ten pixels wide. Otherwise the
+    This is the spot of the first printer if that is between half a pixel and ten pixels wide. If not, the
     printer must be another one, and its spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
@@ -32,7 +32,9 @@ def spot_um(pitch_um: float) -> float:
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """The lengths of a config, from ``set_`` or the defaults, scaled to a pitch; empty at scale 1."""
+    """Return the lengths of a config, from ``set_`` or the defaults, scaled to a pitch; at scale 1, return
+    none.
+    """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
         return {}
@@ -47,8 +49,8 @@ def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: floa
 class SimulatorConfig(BaseModel):
     """Geometry and variant of a model; subclasses add their hyper-parameters.
 
-    ``VARIANT_FIELDS`` lists the fields that a variant sets. The config stores their values, so a saved model
-    does not depend on later definitions of a variant.
+    ``VARIANT_FIELDS`` lists the fields that a variant sets. The config stores the values of these fields, so
+    a saved model does not depend on later definitions of a variant.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -64,7 +66,7 @@ class SimulatorConfig(BaseModel):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """The config of a named variant; ``fields`` (geometry or hyper-parameters) override it.
+        """Make the config of a named variant; ``fields`` (geometry or hyper-parameters) override the variant.
 
         Raises:
             InputError: unknown variant.
@@ -76,13 +78,13 @@ class SimulatorConfig(BaseModel):
 
     @property
     def full_height_um(self) -> float:
-        """Nominal height of the highest level, µm."""
+        """Return the nominal height of the highest level, µm."""
         return (self.levels - 1) * self.level_height_um
 
 
 class Tile(NamedTuple):
-    """Square on which a model is trained and evaluated; neighbours overlap by ``overlap_px`` and are
-    blended.
+    """A square on which a model is trained and evaluated; neighbouring tiles overlap by ``overlap_px`` and
+    are blended.
     """
 
     size_px: int
@@ -92,13 +94,13 @@ class Tile(NamedTuple):
 class Simulator(nn.Module, ABC):
     """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
 
-    A subclass implements ``interior``. A pixel of its result may depend only on the layout within
+    A subclass implements ``interior``. A pixel of the interior may depend only on the layout within
     ``reach_px``, so a crop with this margin gives the same height as the whole field.
     """
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # Whether the height is linear in the parameters, so that one Jacobian serves the whole fit.
+    # Whether the height is linear in the parameters; if so, one Jacobian serves the whole fit.
     is_linear: ClassVar[bool] = False
 
     def __init__(self, config: SimulatorConfig):
@@ -106,7 +108,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """Register a parameter; one that the config fixes is not trained."""
+        """Register a parameter; if the config fixes it, it is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)
@@ -115,69 +117,72 @@ class Simulator(nn.Module, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int | None:
-        """Receptive radius in pixels; None if a pixel depends on the whole image."""
+        """Return the receptive radius in pixels; None if a pixel depends on the whole image."""
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model whose result depends on the size of the image; None for other models."""
+        """Return the tile of a model whose result depends on the size of the image; None for other models."""
         return None
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm.
+        """Return the height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r),
+        µm.
 
-        A model without a receptive radius gets a whole image or one tile, and returns the same size.
+        A model without a receptive radius receives a whole image or one tile, and returns the same size.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Height of the whole field, whose outermost pixels are continued beyond the edge."""
+        """Return the height of the whole field, whose outermost pixels are continued beyond the edge."""
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Height of the whole field without a border of ``border_px``, µm.
+        """Return the height of the whole field without a border of ``border_px``, µm.
 
-        A model without a receptive radius overrides this if it can save the cost of the border. For other
-        models ``predict_inside`` computes only what is needed.
+        A model without a receptive radius overrides this method if it can save the cost of the border. For
+        other models ``predict_inside`` computes only what is needed.
         """
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """The model without its part for the microscope; the model itself if it has none."""
+        """Return the model without its part for the microscope, or the model itself if it has no such
+        part.
+        """
         return self
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Ranges of fitted values, by the name of their parameter (one raw number); other parameters are
-        free.
+        """Return the ranges of fitted values by the name of their parameter (one raw number); other
+        parameters are not limited.
         """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Values on a bound of their range, with that bound."""
+        """Return the values that are on a bound of their range, with that bound."""
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
         return {name: bound for name, bound in bounds.items() if bound is not None}
 
     @property
     def pitch_um(self) -> float:
-        """Pixel pitch of the model, µm."""
+        """Return the pixel pitch of the model, µm."""
         return self.config.pitch_um
 
     @property
     def reach_um(self) -> float | None:
-        """Receptive radius in µm; None if a pixel depends on the whole image."""
+        """Return the receptive radius in µm; None if a pixel depends on the whole image."""
         return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
 
     @property
     def parameter_count(self) -> int:
-        """Number of trained values."""
+        """Return the number of trained values."""
         return sum(parameter.numel() for parameter in self.parameters())
 
 
 def is_small(model: nn.Module) -> bool:
-    """Whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
+    """Return whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
 
     Small models are fitted by least squares (except by the paper's recipe), and in the loop together with the
     effects. Other models are trained by stochastic gradient, and the loop does not refit them.

@@ -1,4 +1,4 @@
-"""``litho-models``: every command parses arguments and calls one public function."""
+"""The command line ``litho-models``: every command parses arguments and calls one public function."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -129,7 +129,7 @@ def evaluate(
         ),
     ] = False,
 ) -> None:
-    """Score one frozen model on a store; on the dataset it was trained on, without the locked scans.
+    """Score one frozen model on a store. On its training dataset the locked scans are left out.
 
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
@@ -179,7 +179,7 @@ def benchmark(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """Train every model per fold and score it on scans it has not seen; resumable.
+    """Train every model without each fold, and score it on the scans of that fold; resumable.
 
     Example: litho-models benchmark prints.zarr --models affine,physics,pbl --out benchmark
     """
@@ -285,7 +285,7 @@ def compare(
     first: Annotated[Path, argument("benchmark.json or evaluation.json")],
     second: Annotated[Path, argument("another one, of the same protocol")],
 ) -> None:
-    """Difference of two results, paired by scan; refuses different data, folds or per-scan terms.
+    """Compare two results, paired by scan; results with different data, folds or per-scan terms are refused.
 
     Example: litho-models compare one/benchmark.json other/benchmark.json
     """
@@ -306,7 +306,7 @@ def freeze(
         ),
     ] = None,
 ) -> None:
-    """Write the process model only: weights, card and a page for people.
+    """Write only the process model: weights, card and a page for people.
 
     Example: litho-models freeze run --out printer
     """
@@ -315,7 +315,7 @@ def freeze(
 
 
 def _attribution(given: Sequence[str]) -> Any:
-    """Parse one side for all effects, or sides by name."""
+    """Parse the attribution: one side for all effects, or a side for each named effect."""
     if len(given) == 1 and "=" not in given[0]:
         return given[0]
     if wrong := [text for text in given if "=" not in text]:
@@ -334,5 +334,5 @@ def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
     """Collect the settings of a training from the given options and ``--set``."""
     found = assigned(words or ())
     if twice := sorted(found.keys() & options.keys()):
-        raise InputError("--set", got=f"{twice[0]}, which an option sets", wanted="another setting")
+        raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two")
     return {name: value for name, value in options.items() if value is not None} | found

@@ -1,4 +1,6 @@
-"""`litho-models board new` and `judge`: stores with hidden causes, and the judge of a loop."""
+"""The commands `litho-models board new` and `judge`: make stores with hidden causes, and judge a loop on
+them.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ def new(
     scans: Annotated[int, typer.Option("--scans", min=2, help="scans in each store")] = 12,
     size_px: Annotated[int, typer.Option("--size-px", help="side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Print and scan in the virtual fab with hidden causes: stores for a loop, the truth for the judge.
+    """Print and scan fields with hidden causes in the virtual fab: stores for a loop, the truth for the
+    judge.
 
     Example: litho-models board new --trials 8 --out board
     """
@@ -50,7 +53,7 @@ def judge(
         ),
     ] = None,
 ) -> None:
-    """Give every store of a board to a loop and judge the causes that it names; resumable.
+    """Give every store of a board to a loop, and judge the causes that the loop names; resumable.
 
     Example: litho-models board judge board --loop "python my_loop.py" --out judged
     """

@@ -1,4 +1,4 @@
-"""`litho-models close-loop`, `next-print` and `check`: correct a model, plan prints, monitor a printer."""
+"""The commands `close-loop`, `next-print` and `check`: correct a model, plan prints, monitor a printer."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -97,7 +97,7 @@ def close_loop(
     typer.echo(f"report: {out / 'report.html'}")
 
 
-# Other than the codes for bad input (2) and for a defect of this package (1).
+# This code differs from those for bad input (2) and for a defect of this package (1).
 EXIT_ALARM = 3
 
 

@@ -1,4 +1,4 @@
-"""`litho-models noise`: the error that no model of the printer can predict."""
+"""The command `litho-models noise`: estimate the error that no model of the printer can predict."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -37,7 +37,8 @@ def noise(
     model: Annotated[str | None, option("which model of the benchmark; its best one by default")] = None,
     seed: Annotated[int, option("seed of the pixels drawn", min=0)] = 0,
 ) -> None:
-    """Roughness, dose matrix, noise budget, σ(x) and its calibration; lengths in µm, noise in nm.
+    """Estimate roughness, dose matrix, noise budget, and σ(x) with its calibration; lengths in µm, noise in
+    nm.
 
     Example: litho-models noise prints.zarr --residuals benchmark --out noise
     """
@@ -50,7 +51,7 @@ def noise(
     of_a_store = _options(name for name, value in (("residuals", residuals), ("model", model)) if value)
     given = _options(of_files)
     if store is not None and of_files:
-        raise InputError("noise", got=f"a store and {given}", wanted="a store, or files without one")
+        raise InputError("noise", got=f"a store and {given}", wanted="either a store or single files")
     if store is not None:
         result = litho_models.analyse_noise(store, out, residuals=residuals, model=model, seed=seed)
     elif flat is None:
@@ -59,7 +60,9 @@ def noise(
     elif of_a_store:
         raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
     elif level_height_um is not None and steps is None:
-        raise InputError("noise", got="--level-height-um", wanted="--steps too, the scan of the steps")
+        raise InputError(
+            "noise", got="--level-height-um without --steps", wanted="--steps with the scan of the step print"
+        )
     else:
         result = analyse_noise_of_files(out, **of_files)
     typer.echo(noise_verdict(result.noise_floor))

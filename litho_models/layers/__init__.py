@@ -1,1 +1,1 @@
-"""Building blocks of models: blurs, pointwise functions, numerical precision."""
+"""Building blocks of models: blurs, pointwise functions and numerical precision."""

@@ -1,4 +1,4 @@
-"""Gaussian blur that is differentiable in its width: separable, normalised, cut at four sigma.
+"""Blur with a separable, normalised Gaussian, cut at four sigma and differentiable in its width.
 
 Along each axis, blocks of pixels are multiplied by a band matrix of the kernel. For fields up to a few
 thousand pixels this is faster than a Fourier transform, and it needs no periodic padding.
@@ -14,17 +14,17 @@ from torch.nn import functional
 from litho_data.foundation.errors import InputError
 
 SUPPORT_SIGMAS = 4.0
-# Smallest sigma: the weight on the next pixel is then negligible (exp(-50)), and 1/sigma stays finite.
+# At this smallest sigma the weight of the next pixel is negligible (exp(-50)), and 1/sigma stays finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Pixels of a block, below and from a radius of 64 px. Wider blocks multiply more zeros of the band; narrower
-# blocks multiply more slowly.
+# Block sizes in pixels for kernels with a radius below 64 px, and for wider ones. Wider blocks multiply more
+# zeros of the band; narrower blocks multiply more slowly.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
-# Wider than any printed field; a larger radius would exhaust memory.
+# This radius is wider than any printed field; a larger one would exhaust memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# Radius of a kernel: four sigma, or three times sigma cut to whole pixels (the authors' code).
+# The radius of a kernel is four sigma, or three sigma cut to whole pixels (the authors' code).
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -38,7 +38,7 @@ def gaussian_blur(
 ) -> Tensor:
     """Blur ``field`` (..., y, x) with a Gaussian of standard deviation ``sigma_um``.
 
-    g(d) ∝ exp(-d²/2σ²), normalised over its support of at least 4σ on each side.
+    The kernel g(d) ∝ exp(-d²/2σ²) is normalised over its support of at least 4σ on each side.
 
     Args:
         field: floating-point tensor (..., y, x).
@@ -81,7 +81,7 @@ def gaussian_blur(
 
 
 def kernel_radius_px(sigma_px: float) -> int:
-    """Radius in whole pixels that contains ``SUPPORT_SIGMAS`` standard deviations; at least 1.
+    """Return a radius, in whole pixels, that contains ``SUPPORT_SIGMAS`` standard deviations; at least 1.
 
     Raises:
         InputError: a Gaussian wider than any field, or without a width.
@@ -96,7 +96,7 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Radius of a kernel by a model's rule, at most ``cap_px`` if given."""
+    """Return the radius of a kernel by a model's rule, at most ``cap_px`` if given."""
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 
@@ -165,9 +165,9 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """For each sample, the overlapping windows of its blocks, as views: (blocks, other axis, window).
+    """Yield for each sample the overlapping windows of its blocks, as views: (blocks, other axis, window).
 
-    Samples are treated one at a time, because a product over several would copy the windows.
+    Samples are treated one at a time, because one product over several samples would copy the windows.
     """
     block, window = band.shape
     count = -(-(samples.shape[axis] - window + block) // block)
@@ -181,10 +181,12 @@ def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
 
 
 def _band(radius: int, sigma_px: Tensor) -> Tensor:
-    """Matrix (block, block + 2 radius) whose row i holds the kernel centred on column i + radius."""
+    """Return the matrix (block, block + 2 radius) whose row i holds the kernel centred on column i +
+    radius.
+    """
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
-    # All rows are windows on the zero-padded kernel, starting with the last row.
+    # Each row is a window on the zero-padded kernel, starting with the last row.
     block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
     kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
     return kernel.unfold(0, block + 2 * radius, 1).flip(0)

@@ -1,4 +1,4 @@
-"""Evaluate functions of single pixels block by block, to limit memory for hidden values."""
+"""Evaluate functions of single pixels block by block, to limit the memory for hidden values."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
-# A hundred hidden values for each of these pixels take 3 MB, which fit into the last-level cache.
+# A hundred hidden values for each of these pixels take 3 MB and fit into the last-level cache.
 _PIXELS_AT_ONCE = 2**13
 
 
@@ -26,7 +26,7 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
         values: Tensor = _WithSlopes.apply(function, *features)
         return values
     if torch.is_grad_enabled():
-        # The backward pass computes hidden values again, because those of a field would take gigabytes.
+        # The backward pass computes hidden values again, because those of a whole field would take gigabytes.
         parts = [checkpoint(function, *block, use_reentrant=False) for block in _in_blocks(features)]
     else:
         parts = [function(*block) for block in _in_blocks(features)]
@@ -36,7 +36,7 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 class _WithSlopes(torch.autograd.Function):
     """Compute values and slopes together, and keep only the slopes for the backward pass.
 
-    The slopes take as much memory as the features and save a second pass over the pixels.
+    The slopes take as much memory as the features, but save a second pass over the pixels.
     """
 
     @staticmethod
@@ -64,7 +64,8 @@ def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
 
 
 def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: float) -> Tensor:
-    """Piecewise-linear function of ``values``, any shape; differentiable in the values and in the knots.
+    """Evaluate a piecewise-linear function at ``values``, any shape; differentiable in the values and in the
+    knots.
 
     Args:
         values: where to evaluate.
@@ -83,8 +84,8 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 class PointwiseNet(nn.Module):
     """A network of one scalar, 1 -> hidden layers -> 1, the same for all pixels (1 x 1 convolutions).
 
-    It is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points and
-    interpolated. This takes a thousand evaluations instead of one per pixel.
+    The network is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points and
+    interpolated. Interpolation takes a thousand evaluations instead of one per pixel.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):
@@ -97,11 +98,11 @@ class PointwiseNet(nn.Module):
         self.knots = knots
 
     def forward(self, values: Tensor, lowest: float, highest: float) -> Tensor:
-        """Evaluate by interpolation; the knots span ``lowest`` ... ``highest``."""
+        """Evaluate by interpolation; the knots span the range from ``lowest`` to ``highest``."""
         return interpolate(values, self.at_knots(lowest, highest), lowest, highest)
 
     def at_knots(self, lowest: float, highest: float) -> Tensor:
-        """The network at the knots, shape (knots,)."""
+        """Return the network's values at the knots, shape (knots,)."""
         parameter = next(self.parameters())
         points = torch.linspace(lowest, highest, self.knots, device=parameter.device, dtype=parameter.dtype)
         return self.exact(points)
@@ -112,7 +113,7 @@ class PointwiseNet(nn.Module):
             return self.layers(values.reshape(-1, 1)).reshape(values.shape)
 
     def start_at_zero(self) -> None:
-        """Make the network the zero function, keeping its hidden layers random."""
+        """Make the network the zero function, but keep its hidden layers random."""
         last = cast(nn.Linear, self.layers[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

@@ -1,4 +1,4 @@
-"""Set the precision of network products, and warn if a lower one is slower on this processor."""
+"""Set the precision of network products, and warn if a lower precision is slower on this processor."""
 
 import sys
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ import torch
 
 Precision = Literal["float32", "bfloat16"]
 
-# PyTorch's names of processor features that multiply in bfloat16: two of x86, two of ARM.
+# PyTorch's names of the processor features that multiply in bfloat16: two of x86, two of ARM.
 _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
 
@@ -22,15 +22,15 @@ def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
-    """Warn once on stderr that float32 would be faster if this processor has no unit for ``precision``."""
+    """Warn once on stderr that float32 would be faster, if this processor has no unit for ``precision``."""
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
         _say("networks in bfloat16: float32 is faster on this processor, which has no bfloat16 unit")
 
 
 def has_bfloat16_unit() -> bool:
-    """Whether this processor multiplies in bfloat16; otherwise bfloat16 is emulated in float32."""
+    """Return whether this processor multiplies in bfloat16; if not, bfloat16 is emulated in float32."""
     known = getattr(torch.cpu, "get_capabilities", None)
-    # Older versions of PyTorch cannot tell; then we assume a unit.
+    # Older versions of PyTorch cannot tell; then we assume that there is such a unit.
     return known is None or any(known().get(unit) for unit in _UNITS)
 
 

@@ -1,8 +1,8 @@
-"""Ranges of fitted values, and the rule for a value on its bound.
+"""Ranges of fitted values, and the rule that says when a value is on its bound.
 
 A fit changes a raw number, and the model uses the corresponding value inside its range. Near a bound the
-value hardly changes with the raw number, so a fit could not return from there. Fits therefore keep raw
-numbers within ``FLAT_FROM``; a value whose raw number is at that limit counts as on its bound.
+value hardly changes with the raw number, so a fit that reached the bound could not return. Fits therefore
+keep raw numbers within ``FLAT_FROM``. A value whose raw number is at that limit counts as on its bound.
 """
 
 import math
@@ -21,7 +21,7 @@ _ROUNDING = 1e-4
 
 @dataclass(frozen=True)
 class Range:
-    """Range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
+    """The range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
 
     Attributes:
         name: name of the value, with its unit.
@@ -33,13 +33,13 @@ class Range:
     upper: float = math.inf
 
     def value(self, raw: Tensor) -> Tensor:
-        """The value that the model uses."""
+        """Return the value that the model uses for a raw number."""
         if math.isinf(self.upper):
             return self.lower + functional.softplus(raw)
         return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
 
     def raw(self, value: float) -> Tensor:
-        """The raw number that gives a value.
+        """Return the raw number that corresponds to a value.
 
         Raises:
             InputError: a value outside the range, or on a bound.
@@ -53,11 +53,11 @@ class Range:
 
     @property
     def raw_ends(self) -> tuple[float, float]:
-        """Smallest and largest raw number that a fit may reach."""
+        """Return the smallest and largest raw number that a fit may reach."""
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """The bound on which a raw number lies; None inside the range."""
+        """Return the bound on which a raw number lies; None inside the range."""
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
             return self.lower

@@ -1,4 +1,4 @@
-"""All models by name."""
+"""All models, by name."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -51,7 +51,7 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
 
 
 def model_class(name: str) -> type[Simulator]:
-    """The class of a model name.
+    """Return the class of the model with this name.
 
     Raises:
         InputError: unknown name.
@@ -77,7 +77,8 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """The parameters that no fit changes: the usual ones and ``fix``, without ``free``.
+    """Return the parameters that no fit changes: the usual ones and those in ``fix``, without those in
+    ``free``.
 
     Raises:
         InputError: an unknown model, or a parameter to free that is not fixed.
@@ -89,7 +90,7 @@ def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) 
 
 
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
-    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters).
+    """Build an untrained model; ``fields`` are config fields (geometry, hyper-parameters).
 
     Raises:
         InputError: an unknown model or field, or a value that the field does not allow.

@@ -1,4 +1,4 @@
-"""Load the authors' weights into our models of variant ``authors``, by translating names.
+"""Load the authors' weights into our models of variant ``authors`` by translating the names.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -27,10 +27,11 @@ _PHYSICS = {
 
 
 def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
-    """PBL, Physics or FNO of variant ``authors`` with the weights of the authors' class of the same kind.
+    """Return our PBL, Physics or FNO of variant ``authors`` with the weights of the authors' class of the
+    same kind.
 
     Args:
-        weights: their ``state_dict``: name to array or tensor; complex numbers as such, or as pairs of
+        weights: their ``state_dict``, from name to array or tensor; complex numbers as such, or as pairs of
             reals along the last axis.
         fields: config fields of the model (geometry).
 
@@ -65,7 +66,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
             got=f"missing, unknown or of another size: {', '.join(wrong)}",
             wanted="their state_dict as a whole",
         )
-    # Our models store their 1 x 1 convolutions as matrices, and their tensors of shape (1,) as plain numbers.
+    # Our models store 1 x 1 convolutions as matrices, and tensors of shape (1,) as plain numbers.
     model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})
     return model.eval()
 
@@ -100,7 +101,7 @@ def _fno_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         names |= {f"w{i}.{kind}": f"local.{i}.{kind}" for i in range(4)}
     state = {names.get(name, name): value for name, value in own.items()}
     for i in range(4):
-        # Our parameter holds the matrices of both signs of the frequency along y.
+        # Our parameter contains the matrices for both signs of the frequency along y.
         signs = [state.pop(f"conv{i}.weights{sign}", None) for sign in (1, 2)]
         pair = [matrix for matrix in signs if matrix is not None]
         if len(pair) == 2 and pair[0].shape == pair[1].shape:

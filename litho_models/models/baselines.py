@@ -69,7 +69,7 @@ class BlurTable(Simulator):
 
     @property
     def sigma_um(self) -> Tensor:
-        """Blur, between 0 and ``sigma_max_um``."""
+        """Return the blur, between 0 and ``sigma_max_um``."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -117,7 +117,7 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """One blur (or a pair along y, along x), without pixels within ``reach_px`` of the edge."""
+    """Apply one blur (or a pair along y, along x), without the pixels within ``reach_px`` of the edge."""
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
     rows, columns = (
@@ -136,7 +136,8 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """H = w · φ(M): Gaussian blurs, second to fourth power of one blur, its squared slopes, and 1.
+    """H = w · φ(M), where φ contains Gaussian blurs, second to fourth powers of one blur, its squared slopes,
+    and 1.
 
     Slopes along y and x have separate weights, because the two axes of a print may differ.
     """
@@ -160,7 +161,7 @@ class Linear(Simulator):
         return (self.weights * self.features(layout_um)).sum(dim=-1)
 
     def features(self, layout_um: Tensor) -> Tensor:
-        """φ(M) of the interior, (b, 1, y, x, features)."""
+        """Return the features φ(M) of the interior, (b, 1, y, x, features)."""
         config, reach = self.config, self.reach_px
         blurs = [blurred_interior(layout_um, sigma, self.pitch_um, reach) for sigma in config.sigmas_um]
         wide = blurred_interior(layout_um, config.power_sigma_um, self.pitch_um, reach - 1)

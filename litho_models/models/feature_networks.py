@@ -1,7 +1,7 @@
 """Networks on fixed features of a field: the surroundings of a layout's pixel, or the height along x.
 
-The features have no parameters, so such a network is fitted to single pixels
-(``litho_models.fitting.pixels``). This takes seconds; training on crops takes minutes.
+The features have no parameters, so these networks are fitted to single pixels
+(``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
 """
 
 from abc import abstractmethod
@@ -17,8 +17,8 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# Change over σ, relative to the highest level, below which the length of a slope is smoothed, so that it has
-# a derivative at 0: 2 nm.
+# Below this change over σ, relative to the highest level (2 nm), the length of a slope is smoothed so that it
+# has a derivative at 0.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
@@ -45,7 +45,9 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 
 class FeatureNetwork(OfField, nn.Module):
-    """A function of the features of each pixel, µm: a linear part plus a network; zero at the start."""
+    """A function of the features of each pixel, µm: the sum of a linear part and a network, zero at the
+    start.
+    """
 
     # Whether the network may add a constant height.
     has_constant: ClassVar[bool] = True
@@ -69,7 +71,7 @@ class FeatureNetwork(OfField, nn.Module):
 
     @abstractmethod
     def features(self, field_um: Tensor) -> list[Tensor]:
-        """Features (b, 1, y - 2r, x - 2r) of a field (b, 1, y, x), r = ``reach_px``."""
+        """Compute features (b, 1, y - 2r, x - 2r) of a field (b, 1, y, x), where r is ``reach_px``."""
 
     @property
     def reach_px(self) -> int:
@@ -79,7 +81,7 @@ class FeatureNetwork(OfField, nn.Module):
         return max(self._radius(*config.blurs_um), slopes, self._steps_px()[-1], steep)
 
     def forward(self, field_um: Tensor) -> Tensor:
-        """The network's contribution to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
+        """Return the network's contribution to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
         features = self.features(field_um)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
             pixels = (feature.flatten() for feature in features)
@@ -90,7 +92,7 @@ class FeatureNetwork(OfField, nn.Module):
         return self.at_pixels(torch.stack(features))
 
     def at_pixels(self, features: Tensor) -> Tensor:
-        """The same from features (features, n): (n,) µm."""
+        """Compute the contribution to the height, (n,) µm, from features (features, n)."""
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
         # The weights include the standardisation, which saves a pass over the pixels.
@@ -108,12 +110,14 @@ class FeatureNetwork(OfField, nn.Module):
         self.scale.copy_(scale)
 
     def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
-        """Local means around each pixel of a field with a margin."""
+        """Return the local means around each pixel of a field with a margin."""
         return [blurred_interior(field, width, self.pitch_um, margin_px) for width in self.config.steep_um]
 
 
 class Surroundings(FeatureNetwork):
-    """Features of the layout near a pixel, x and y alike: blurs, slopes, displaced copies, mean steepness."""
+    """Features of the layout near a pixel that treat x and y alike: blurs, slopes, displaced copies, mean
+    steepness.
+    """
 
     def features(self, field_um: Tensor) -> list[Tensor]:
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
@@ -135,7 +139,9 @@ class Surroundings(FeatureNetwork):
         return found + self._averaged(length, margin) + self._averaged(length * length, margin)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Length of the slope over σ and curvature over σ²; from a height with a margin of 1 px."""
+        """Return the length of the slope over σ, and the curvature over σ², from a height with a margin of 1
+        px.
+        """
         up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
@@ -144,7 +150,8 @@ class Surroundings(FeatureNetwork):
 
 
 class ScanAxis(FeatureNetwork):
-    """Features of a printed height along x, the microscope's lines: slopes, steps, mean steepness.
+    """Features of a printed height along x, the direction of the microscope's lines: slopes, steps, mean
+    steepness.
 
     All features are 0 where the print does not change along x, so the network adds nothing there.
     """
@@ -173,14 +180,16 @@ class ScanAxis(FeatureNetwork):
         return found + self._averaged(slope.abs(), margin) + self._averaged(slope * slope, margin)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Slope over σ and curvature over σ², both along x; from a height with a margin of 1 px."""
+        """Return the slope over σ and the curvature over σ², both along x, from a height with a margin of 1
+        px.
+        """
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
-    """Apply the layer to values (inputs, n), pixels last: (outputs, n)."""
+    """Apply the layer to values (inputs, n), with the pixels last; return (outputs, n)."""
     if layer.bias is None:
         return layer.weight @ values
     return torch.addmm(layer.bias[:, None], layer.weight, values)

@@ -13,7 +13,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# Relative height per µm below which the length of a slope is smoothed, so that it has a derivative at 0.
+# Below this relative height per µm the length of a slope is smoothed, so that it has a derivative at 0.
 _LEAST_SLOPE = 1e-4
 
 
@@ -37,7 +37,7 @@ class FeaturesConfig(SimulatorConfig):
 
 
 class OfField(ABC):
-    """Common parts of features: blurs, displacements, and their reach."""
+    """What all features share: blurs, displacements, and their reach."""
 
     config: Any
     pitch_um: float
@@ -45,10 +45,10 @@ class OfField(ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int:
-        """Receptive radius of the features."""
+        """Return the receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """The smallest field, which gives the features of one pixel."""
+        """Return the smallest field, which gives the features of one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -68,11 +68,11 @@ class OfField(ABC):
 class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
-    φ: blurs with their cubes and the products of each pair; slopes along y and x at several blurs, their
-    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps to them;
-    blurs along one axis; steepness of the surroundings along each axis. The sizes |∂x| and |∂y| are separate
-    features, because a microscope's lines make the two axes differ. The weights are found in closed form, see
-    ``litho_models.fitting.ridge``.
+    φ contains blurs with their cubes and the products of each pair; slopes along y and x at several blurs,
+    with their sizes, products and second derivatives; copies displaced to one side, and the sizes of the
+    steps to them; blurs along one axis; and the steepness of the surroundings along each axis. The sizes |∂x|
+    and |∂y| are separate features, because the microscope's lines make the two axes differ.
+    ``litho_models.fitting.ridge`` finds the weights in closed form.
     """
 
     name = "features"
@@ -103,11 +103,13 @@ class Features(OfField, Simulator):
         return self.weights @ self.completed(torch.stack(features))
 
     def completed(self, features: Tensor) -> Tensor:
-        """All that has a weight, (weights, n), from φ(M) of n pixels."""
+        """Return all features that have a weight, (weights, n), from φ(M) of n pixels."""
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """φ(M) of the interior, (b, 1, y, x) each: blurs, slopes, displaced copies; their products, and 1."""
+        """Return φ(M) of the interior, (b, 1, y, x) each: blurs, slopes and displaced copies, then their
+        products and 1.
+        """
         config = self.config
         layout = layout_um / config.full_height_um
         blurs = [self._blurred(layout, sigma) for sigma in config.sigmas_um]
@@ -122,12 +124,16 @@ class Features(OfField, Simulator):
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """All that has a weight, (weights, n), at flat indices of the interior of one layout (1, 1, y, x)."""
+        """Return all features that have a weight, (weights, n), at flat indices of the interior of a layout
+        (1, 1, y, x).
+        """
         simple, products = self.features(layout_um)
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
 
     def _slopes(self, height: Tensor) -> list[Tensor]:
-        """Height, slopes, their sizes and second derivatives, per µm; from a height with a margin of 1 px."""
+        """Return height, slopes, their sizes and second derivatives, per µm, from a height with a margin of 1
+        px.
+        """
         pitch, inner = self.pitch_um, crop_border(height, 1)
         up, down, left, right = neighbours(height, 1)
         y, x = (down - up) / (2 * pitch), (right - left) / (2 * pitch)
@@ -136,7 +142,9 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Copies displaced to each side, and the sizes of the steps to them and between opposite ones."""
+        """Return copies displaced to each side, the sizes of the steps to the copies, and those between
+        opposite copies.
+        """
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
         here = crop_border(sharp, steps[-1])
@@ -148,13 +156,13 @@ class Features(OfField, Simulator):
         return found
 
     def _streaks(self, layout: Tensor) -> list[Tensor]:
-        """Blurs that are wide along one axis (y, then x) and one pixel wide along the other."""
+        """Return blurs that are wide along one axis (y, then x) and one pixel wide along the other."""
         wide, narrow = self.config.streak_sigmas_um, self.pitch_um
         pairs = [pair for sigma in wide for pair in ((sigma, narrow), (narrow, sigma))]
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
 
     def _steepness(self, layout: Tensor) -> list[Tensor]:
-        """Means around each pixel of |slope| and slope² along y and x; a slope is a height change over σ."""
+        """Return local means of |slope| and slope² along y and x; a slope is a height change over σ."""
         widths, found = self.config.steep_widths_um, []
         margin = self._radius(*widths)
         for sigma in self.config.steep_sigmas_um:
@@ -177,10 +185,11 @@ class RandomFeaturesConfig(FeaturesConfig):
 
 
 class RandomFeatures(Features):
-    """``Features`` plus tanh(V z + c), z the standardised simple features, V and c random and fixed.
+    """``Features`` plus tanh(V z + c), where z are the standardised simple features; V and c are random and
+    fixed.
 
-    This is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It learns
-    more than products of two features, still in closed form.
+    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
+    learn more than products of two features, but still in closed form.
     """
 
     name = "random-features"
@@ -214,6 +223,8 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The pixels ``step`` above, below, left and right of all pixels farther than ``step`` from the edge."""
+    """Return the neighbours ``step`` above, below, left and right of all pixels farther than ``step`` from
+    the edge.
+    """
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

@@ -1,9 +1,10 @@
-"""FNO: the Fourier neural operator, the paper's learned simulator without physics inside.
+"""FNO: the Fourier neural operator, the paper's learned simulator that contains no physics.
 
-arXiv:2309.17343, appendix "Fourier Neural Operator": the two-dimensional operator of Li et al. 2020
-(arXiv:2010.08895) with 12 x 12 modes and width 24. A layer adds a product in Fourier space, which sees the
-whole image, to a local convolution. The operator is periodic in the image and its modes count periods per
-image, so its result depends on the image size. ``default`` therefore runs it on tiles of one size.
+The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
+24; see arXiv:2309.17343, appendix "Fourier Neural Operator". Each layer adds a product in Fourier space,
+which sees the whole image, to a local convolution. The operator takes the image as periodic, and its modes
+count periods per image, so the result depends on the image size. The variant ``default`` therefore runs the
+operator on tiles of one size.
 """
 
 from typing import Any, ClassVar, Self
@@ -17,7 +18,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Largest number of weights that a card may request: ninety times the paper's, 0.5 GB.
+# Largest number of weights that a card may request: ninety times the number in the paper, 0.5 GB.
 _MOST_MATRIX_ENTRIES = 30_000_000
 
 
@@ -27,7 +28,7 @@ class FnoConfig(SimulatorConfig):
     modes: tuple[PositiveInt, PositiveInt] = (12, 12)
     width: int = Field(24, ge=1, le=1024, description="channels of the layers")
     projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
-    # 1 x 1 in the paper, which can only map detail beyond the kept modes pixel by pixel.
+    # The paper uses 1 x 1, which can map detail beyond the kept modes only pixel by pixel.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
     padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
@@ -62,8 +63,8 @@ class Fno(Simulator):
     """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), no gelu after the last.
 
     P lifts each pixel to ``width`` channels, and Q maps them to a height through one hidden layer. With
-    ``starts_as_layout`` this height is added to M and starts at zero. Where the config has a tile,
-    ``interior`` is the height of one tile, taken as periodic, and the field is blended from tiles.
+    ``starts_as_layout`` this height is added to M and starts at zero. If the config has a tile, ``interior``
+    is the height of one tile, taken as periodic, and the field is blended from tiles.
     """
 
     name = "fno"
@@ -93,11 +94,11 @@ class Fno(Simulator):
         return None if size is None else Tile(size, self.config.overlap_px)
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm."""
+        """Return the height of a whole image, of the same size, (batch, 1, y, x) µm."""
         config = self.config
         ny, nx = layout_um.shape[-2:]
-        # Heights need full precision where they enter and leave, also under autocast. Channels are last, so
-        # that products over channels are matrix products.
+        # Heights need full precision where they enter and leave, even under autocast. The channels are the
+        # last axis, so that products over channels are matrix products.
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
             features = _pointwise(self.lift, inputs.permute(0, 2, 3, 1))
@@ -120,7 +121,7 @@ class Fno(Simulator):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole field, (batch, 1, y, x) µm."""
         return self.inside(layout_um, 0)
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
@@ -140,11 +141,11 @@ class PeriodicConvolution(nn.Conv2d):
 
 
 class SpectralConvolution(nn.Module):
-    """A product v̂'(k) = W(k) v̂(k) with a matrix over channels at each of the lowest frequencies; others are
-    zero.
+    """A product v̂'(k) = W(k) v̂(k) with a matrix over channels at each of the lowest frequencies; other
+    frequencies are set to zero.
 
-    The weights are real, (sign of k_y, in, out, modes y, modes x, real and imaginary part), so that
-    they can be stored and cast like any other parameter.
+    The weights are real, with shape (sign of k_y, in, out, modes y, modes x, real and imaginary part), so
+    that they can be stored and cast like any other parameter.
     """
 
     def __init__(self, channels: int, modes: tuple[int, int]):
@@ -152,7 +153,9 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field (b, y, x, channels); an image smaller than the modes keeps those it has."""
+        """Convolve a field (b, y, x, channels); an image smaller than the modes uses only the modes that it
+        has.
+        """
         ny, nx = field.shape[1:3]
         modes_y, modes_x = self.weight.shape[3:5]
         kept_y, kept_x = min(modes_y, ny // 2), min(modes_x, nx // 2 + 1)
@@ -161,7 +164,7 @@ class SpectralConvolution(nn.Module):
             spectra = torch.fft.fft(along_x, dim=1)
             positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
             mixed = torch.zeros_like(spectra)
-            # Rows of a spectrum begin with frequency 0 and end with -1.
+            # The rows of a spectrum begin with frequency 0 and end with -1.
             for rows, matrices in (
                 (slice(kept_y), positive[:, :, :kept_y]),
                 (slice(ny - kept_y, ny), negative[:, :, modes_y - kept_y :]),
@@ -171,12 +174,12 @@ class SpectralConvolution(nn.Module):
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
-    """A 1 x 1 convolution with the channels last."""
+    """Apply a 1 x 1 convolution to features whose channels are the last axis."""
     return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
 
 
 def _coordinates(layout: Tensor) -> Tensor:
-    """y and x of each pixel on 0 ... 1, (batch, 2, y, x)."""
+    """Return the coordinates y and x of each pixel on 0 ... 1, (batch, 2, y, x)."""
     y, x = (
         torch.linspace(0, 1, size, device=layout.device, dtype=layout.dtype) for size in layout.shape[-2:]
     )

@@ -1,9 +1,9 @@
-"""Partially coherent imaging by a sum of coherent systems (SOCS).
+"""Compute partially coherent images as a sum of coherent systems (SOCS).
 
-Hopkins: I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross coefficients C(f₁,
-f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408 (1953)). C is A⁺A
-with A(s, f) = P(s + f), so the singular vectors of A are the kernels: I = Σ_k |h_k * t|² (Cobb, PhD thesis,
-Berkeley 1998).
+Hopkins' image is I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross
+coefficients C(f₁, f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408
+(1953)). C is A⁺A with A(s, f) = P(s + f), so the singular vectors of A are the kernels, and I = Σ_k |h_k *
+t|² (Cobb, PhD thesis, Berkeley 1998).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from litho_data.foundation.errors import InputError
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
-# Sample points along each side of a frequency cell, for the share that the source fills. The number is odd,
-# so one point is the centre.
+# Number of sample points along each side of a frequency cell, to find the share of the cell that the source
+# fills. The number is odd, so one point is the centre.
 _COUNTED = 9
 
 
@@ -45,22 +45,26 @@ class Optics(NamedTuple):
 
 
 def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
-    """Pixels that a kernel reaches to each side."""
+    """Return how many pixels a kernel reaches to each side."""
     return max(1, math.ceil(_REACH * optics.wavelength_um / optics.na / pitch_um))
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
-    """Image of a mask (b, 1, y, x), relative to an open mask, without a border as wide as the kernels."""
+    """Return the image of a mask (b, 1, y, x), relative to an open mask, without a border as wide as the
+    kernels' reach.
+    """
     reach = kernel_reach_px(optics, pitch_um)
     ny, nx = transmission.shape[-2:]
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
-    # Transforms spread rounding over the field. Double precision keeps tiles equal to the whole field.
+    # Transforms spread rounding errors over the field. Double precision keeps the result in tiles equal to
+    # that of the whole field.
     image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
     return image.to(transmission.dtype)
 
 
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
-    """Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the kernels.
+    """Return Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the
+    kernels.
 
     The mask is transformed once; the transforms back run in one batch over all kernels.
     """
@@ -69,9 +73,10 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
 
 
 def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
-    """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
+    """Return the kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
 
-    Source points lie on the grid of the field's frequencies, each weighted by the filled share of its cell.
+    Source points lie on the grid of the field's frequencies, and each is weighted by the filled share of its
+    cell.
 
     Raises:
         InputError: a ring too thin to fill any cell.
@@ -99,7 +104,9 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
 
 
 def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics) -> np.ndarray:
-    """Share of the cells (y, x) around frequencies, relative to the pupil, that the source fills."""
+    """Return the share of each cell (y, x) that the source fills; cells lie around frequencies relative to
+    the pupil.
+    """
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
     for by_y in inside * cell[0]:
@@ -110,7 +117,7 @@ def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics)
 
 
 def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
-    """Amplitude that passes the pupil, with the phase of a defocus."""
+    """Return the amplitude that passes the pupil, with the phase of a defocus."""
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)
     along = np.sqrt(np.where(inside, 1 - squared, 1.0)) - 1
@@ -119,13 +126,13 @@ def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
+    """Return the transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
     reach = size_px // 2
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
     placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
-    # An open mask has the intensity 1 for any number of kernels.
+    # An open mask has intensity 1 for any number of kernels.
     spectra = np.fft.fft2(placed)
     spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
     return torch.from_numpy(spectra)

@@ -1,6 +1,6 @@
-"""The parts of a printer: functions from one field to the next, with parameters and a source.
+"""The parts of a printer: functions that turn one field into the next, with parameters and a source.
 
-Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop them by its reach.
+Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by its reach.
 """
 
 import math
@@ -18,9 +18,9 @@ from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
 from litho_models.simulator import crop_border
 
-# Change of the resist between pixels below which no edge exists.
+# If the resist changes less than this between pixels, it has no edge there.
 FLATTEST = 5e-3
-# The range of a length ends at this multiple of its starting value.
+# The upper limit of a length is this multiple of its starting value.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
@@ -35,7 +35,7 @@ class Number:
 
     Attributes:
         start: starting value; ``unit``: ``1`` for none.
-        lower, upper: its range; by default a length ends at five times its start.
+        lower, upper: its range; by default the upper limit of a length is five times its start.
         fitted: whether a fit changes it; otherwise it keeps its value.
     """
 
@@ -46,7 +46,7 @@ class Number:
     fitted: bool = True
 
     def range_at(self, name: str, start: float) -> Range:
-        """The range of a fit that begins at ``start``."""
+        """Return the range of a fit that begins at ``start``."""
         upper = self.upper if self.upper is not None else _WIDEST * start if self.unit == "µm" else math.inf
         return Range(name, self.lower, upper)
 
@@ -70,7 +70,7 @@ class Part:
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
-    """Pixels that a Gaussian spot reaches."""
+    """Return how many pixels a Gaussian spot reaches."""
     # Float32 rounds a width, and its last digits must not change the size of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
@@ -78,10 +78,10 @@ def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
 def illuminate(
     pattern: Tensor, spots: Sequence[tuple[Tensor | float, Tensor]], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Illumination: exposure by a spot of several Gaussians, Σ share · G_sigma; cropped by ``reach_px``.
+    """Expose with a spot of several Gaussians, Σ share · G_sigma; the result is cropped by ``reach_px``.
 
-    One Gaussian describes light or a fine beam, a second, wide one backscattered electrons (Chang, J. Vac.
-    Sci. Technol. 12, 1271 (1975)), and a third lies between them.
+    One Gaussian describes light or a fine beam; a second, wide one describes backscattered electrons (Chang,
+    J. Vac. Sci. Technol. 12, 1271 (1975)); a third lies between these two.
 
     Args:
         pattern: written pattern, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each
@@ -97,7 +97,9 @@ def illuminate(
 
 
 def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
-    """Resist: smoothed threshold, 0 at 0 and 1 at 1 (Wang et al. 2011, doi:10.1007/s00158-010-0602-y)."""
+    """Apply a smoothed threshold of the resist, 0 at 0 and 1 at 1 (Wang et al. 2011,
+    doi:10.1007/s00158-010-0602-y).
+    """
     low = torch.tanh(steepness * threshold)
     return (low + torch.tanh(steepness * (exposure - threshold))) / (
         low + torch.tanh(steepness * (1 - threshold))
@@ -105,22 +107,28 @@ def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
 
 
 def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
-    """Resist: share that a dose converts, E^γ / (E^γ + η^γ), contrast γ; one half at the threshold η."""
+    """Return the share of resist that a dose converts, E^γ / (E^γ + η^γ), with contrast γ; it is one half at
+    the threshold η.
+    """
     turned = exposure.clamp(min=1e-6) ** contrast
     return turned / (turned + threshold**contrast)
 
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
-    """Resist: share of the depth developed, 1 + γ log₁₀(E / E₀) between 0 and 1, its corners rounded."""
+    """Return the share of the depth developed, 1 + γ log₁₀(E / E₀), limited to 0 ... 1 with rounded
+    corners.
+    """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
     return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Transfer: coverage of a film that stays where resist exceeds the threshold; cropped by one pixel.
+    """Return the coverage of a film that remains where resist exceeds the threshold; the result is cropped by
+    one pixel.
 
-    The edge lies where the resist crosses the threshold, moved outward by the bias; a pixel that it crosses
-    is covered in part: a sigmoid, one pixel wide, of the distance (resist - threshold) / |∇ resist| + bias.
+    The edge lies where the resist crosses the threshold, moved outward by the bias. A pixel that the edge
+    crosses is covered in part: a sigmoid, one pixel wide, of the distance (resist - threshold) / |∇ resist| +
+    bias.
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
@@ -129,7 +137,7 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
 
 
 def _spots(values: Values) -> list[tuple[Tensor | float, Tensor]]:
-    """Share and width of each Gaussian of a spot of one to three."""
+    """Return the share and width of each Gaussian of a spot with one to three Gaussians."""
     back, between = values.get("back_share", 0.0), values.get("between_share", 0.0)
     shares = {"sigma_um": (1 - back) * (1 - between), "back_um": back, "between_um": (1 - back) * between}
     return [(share, values[name]) for name, share in shares.items() if name in values]
@@ -255,7 +263,7 @@ def register_part(part: Part) -> Part:
 
 
 def part_of(name: str) -> Part:
-    """The part of that name.
+    """Return the part of that name.
 
     Raises:
         InputError: there is none.

@@ -1,8 +1,8 @@
-"""PBL: physics-based learning, the paper's simulator with networks for its unknown steps.
+"""PBL: physics-based learning, the paper's simulator, with networks for the unknown steps of the process.
 
-arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model": optical
-blur of fixed width, pointwise network (exposure threshold), diffusion blur of learned width, pointwise
-network (shrinkage), areawise network (everything else).
+It chains an optical blur of fixed width, a pointwise network (exposure threshold), a diffusion blur of
+learned width, a pointwise network (shrinkage) and an areawise network (everything else); see
+arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model".
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class PblConfig(SimulatorConfig):
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
-    # Wider than the areawise network sees (0.5 µm), so the blur starts where no other part can learn.
+    # The blur starts wider than the areawise network can see (0.5 µm), where no other part can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
@@ -53,7 +53,7 @@ class PblConfig(SimulatorConfig):
     edge: Edge = "replicate"
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
-    # These three are not in the paper.
+    # The next three fields are not in the paper.
     transposable: bool = Field(False, description="areawise network that treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
     scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
@@ -79,7 +79,9 @@ class PblConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As for other models; the lengths of the feature networks are also scaled."""
+        """Make the config of a variant as for other models; the lengths of the feature networks are scaled
+        too.
+        """
         config = super().of_variant(variant, **fields)
         parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
         scaled = {
@@ -99,13 +101,13 @@ class PblConfig(SimulatorConfig):
 class Pbl(Simulator):
     """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
 
-    With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I),
-    g_shrink = 1 + net, g_mismatch(H) = H + net(H), last layers zero at the start.
+    With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I), g_shrink = 1 +
+    net, g_mismatch(H) = H + net(H). Their last layers are zero at the start.
 
     The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
     the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
-    height along x on the measured map. It is fitted together with the chain, so the chain does not learn this
-    influence, and is left out of ``printer()``.
+    height along x on the measured map. ``scan_axis`` is fitted together with the chain, so that the chain
+    does not learn this influence. It is left out of ``printer()``.
     """
 
     name = "pbl"
@@ -129,18 +131,18 @@ class Pbl(Simulator):
 
     @property
     def feature_networks(self) -> list[FeatureNetwork]:
-        """The feature networks that the model has, in the order of ``feature_fields``."""
+        """Return the model's feature networks, in the order of ``feature_fields``."""
         return [network for network in (self.surroundings, self.scan_axis) if network is not None]
 
     def printer(self) -> Pbl:
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """A copy of the paper's chain alone."""
+        """Copy the paper's chain alone."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
-        """Replace the weights of the chain."""
+        """Replace the weights of the chain by those of another."""
         self.load_state_dict(self.state_dict() | chain.state_dict())
 
     def _without(self, *parts: str) -> Pbl:
@@ -155,7 +157,7 @@ class Pbl(Simulator):
 
     @property
     def sigma_diffusion_um(self) -> Tensor:
-        """η / (1 + exp(-τ)), µm."""
+        """Return the diffusion length η / (1 + exp(-τ)), µm."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -174,7 +176,7 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The chain's height of the interior, and the input fields of each feature network, µm."""
+        """Return the chain's height of the interior, and the input fields of each feature network, µm."""
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
         printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
         around = self.surroundings
@@ -182,11 +184,11 @@ class Pbl(Simulator):
         return crop_border(printed, along), layouts if self.scan_axis is None else [*layouts, printed]
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole field, (batch, 1, y, x) µm."""
         return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
-        """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
+        """Apply the paper's chain to a field with nothing beyond its edge, or only to its interior."""
         optical, diffusion = self._radii_px()
         initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
         dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
@@ -221,7 +223,7 @@ class Pbl(Simulator):
 
     def _shrink_by_table(self, dose: Tensor) -> Tensor:
         # A blur averages, so the dose stays in the range of its input. The threshold network's range is that
-        # of its knots, independent of the image.
+        # of its knots, whatever the image.
         full = self.config.full_height_um
         knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
         reachable = self.thresh.at_knots(0.0, full).detach()
@@ -239,7 +241,7 @@ class Pbl(Simulator):
 class AreawiseNet(nn.Module):
     """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
 
-    ``transposable``: each kernel is averaged with its transpose, which treats x and y alike.
+    With ``transposable``, each kernel is averaged with its transpose, which treats x and y alike.
     """
 
     def __init__(self, channels: tuple[int, ...], leaky_slope: float, transposable: bool = False):
@@ -259,12 +261,14 @@ class AreawiseNet(nn.Module):
         return len(self.hidden) + 1
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
-        """Interior of (b, 1, y, x) without padding; the same size with a zero padding of 1 per layer."""
+        """Return the interior of (b, 1, y, x) without padding, or the same size with a zero padding of 1 per
+        layer.
+        """
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
             features = functional.leaky_relu(features, self.leaky_slope, inplace=True)
-        # The sum over channels is the height, so it needs full precision even if the stack runs in bfloat16.
+        # The sum over channels is the height, so it needs full precision even if the layers run in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding
@@ -275,6 +279,6 @@ class AreawiseNet(nn.Module):
         return (kernel + kernel.transpose(-1, -2)) / 2 if self.transposable else kernel
 
     def start_at_zero(self) -> None:
-        """Make the network the zero function, keeping its hidden layers random."""
+        """Make the network the zero function, but keep its hidden layers random."""
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(cast(Tensor, self.last.bias))

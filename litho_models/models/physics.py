@@ -1,7 +1,7 @@
-"""Physics: the paper's parameterised simulator with five or six physical values.
+"""Physics: the paper's parameterised simulator, with five or six physical values.
 
-Optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
-shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model".
+It chains optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
+shrinkage and height bias; see arXiv:2309.17343, appendix "Parameterized physics model".
 """
 
 import math
@@ -48,7 +48,7 @@ class PhysicsConfig(SimulatorConfig):
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
     gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
-    # With 1 the equations are in µm, with None in units of the full height; the paper has no such height.
+    # With 1 the equations are in µm, and with None in units of the full height; the paper has no such height.
     reference_height_um: float | None = Field(
         None, gt=0, description="height that is 1; None: the highest level"
     )
@@ -80,9 +80,9 @@ class Physics(Simulator):
 
     In ``default`` H₀ is the nominal full height and g a gain; without it a full level would always print H₀ +
     b. In ``paper`` and ``authors`` H₀ is 1 µm and g is 1. With a threshold below 0, before the first level,
-    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1:
-    against the fixed reference 0 ... 1 (``default``), the range of the image (``paper``) or its maximum
-    (``authors``). The last two depend on the crop.
+    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, where u is the diffused dose on
+    0 ... 1. Its range is fixed to 0 ... 1 in ``default``, and is the range of the image in ``paper`` or its
+    maximum in ``authors``. In ``paper`` and ``authors`` the result therefore depends on the crop.
     """
 
     name = "physics"
@@ -122,7 +122,9 @@ class Physics(Simulator):
         return keys[self.config.spot]
 
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
-        """Standard deviation of the spot along y and along x, µm; an unfitted one is a plain number."""
+        """Return the standard deviation of the spot along y and along x, µm; an unfitted value is a plain
+        number.
+        """
         keys = self._spot_keys or ("",)
         given = self.config.sigma_optical_um
         widths = [values.get(key.removeprefix("raw_"), given) for key in keys]
@@ -130,7 +132,9 @@ class Physics(Simulator):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um; fitted widths, gain."""
+        """Return the physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um, fitted widths and
+        gain.
+        """
         ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
         return {**ranged, "bias_um": self.bias_um}
 
@@ -148,11 +152,11 @@ class Physics(Simulator):
         return self._printed(layout_um, None)
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole field, (batch, 1, y, x) µm."""
         return self._printed(layout_um, self.config.edge)
 
     def _printed(self, layout_um: Tensor, edge: Edge | None) -> Tensor:
-        """Height of the field with what lies beyond its edge, or of its interior alone."""
+        """Return the height of the field including what lies beyond its edge, or only of its interior."""
         values = self.values
         optical, diffusion = self._radii_px(values)
         # Beyond the radius of the optical blur, a continued layout stays constant when blurred.
@@ -166,11 +170,12 @@ class Physics(Simulator):
     def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
         return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
-    # The methods below take the values, computed once per pass: in forward mode every operation is slow.
+    # The methods below take the values as arguments. They are computed once per pass, because in forward mode
+    # every operation is slow.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        # Float32 rounds a width; its last digits must not move the edge of the kernel.
+        # Float32 rounds a width, and its last digits must not move the edge of the kernel.
         widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
         spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (

@@ -1,4 +1,4 @@
-"""Printers made of parts: one model with settings for several machines."""
+"""Printers built from parts: one model with settings for several machines."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 
 class PrinterConfig(SimulatorConfig):
-    """The parts in order, and fixed or initial values of their parameters by ``part.parameter``.
+    """The parts in order, and fixed or initial values of their parameters, by ``part.parameter``.
 
-    Each parameter can also be set like a field, as ``spot.sigma_um``.
+    Each parameter can also be set like a field, for example as ``spot.sigma_um``.
     """
 
     parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names in order of action")
@@ -23,7 +23,7 @@ class PrinterConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """As for other models, with parameters of parts among the fields."""
+        """Make the config of a variant as for other models; the fields may include parameters of parts."""
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
         parts = fields.get("parts", cls.model_fields["parts"].default)
@@ -38,14 +38,14 @@ class PrinterConfig(SimulatorConfig):
             raise ValueError("a part is named twice")
         for name, value in self.numbers.items():
             if name not in known:
-                raise ValueError(f"{name} is no number of these parts; there are {', '.join(known)}")
+                raise ValueError(f"{name} is not a number of these parts, which are {', '.join(known)}")
             upper = known[name].range_at(name, value).upper
             if not known[name].lower <= value <= upper:
                 raise ValueError(f"{name} is {value:g}, not within {known[name].lower:g} to {upper:g}")
         return self
 
     def all_numbers(self) -> list[tuple[Part, str, Number]]:
-        """All parameters of all parts by name."""
+        """Return all parameters of all parts, by name."""
         found = map(part_of, self.parts)
         return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
 
@@ -75,7 +75,7 @@ class Printer(Simulator):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """The fitted values by name, ``part.number``."""
+        """Return the fitted values by name, ``part.number``."""
         return {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
 
     @property
@@ -89,7 +89,7 @@ class Printer(Simulator):
         return self.config.full_height_um * field
 
     def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
-        """The parts, each with its values by name; unfitted values are plain numbers."""
+        """Return the parts, each with its values by name; unfitted values are plain numbers."""
         known = {**self.config.numbers, **self.values}
         found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}
         for part, name, number in self.config.all_numbers():
@@ -98,7 +98,7 @@ class Printer(Simulator):
 
 
 def _key(name: str) -> str:
-    """Name of a torch parameter, which must not contain a full stop."""
+    """Return the name of a torch parameter, which must not contain a full stop."""
     return f"raw_{name.replace('.', '__').replace('-', '_')}"
 
 
@@ -139,7 +139,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A relief written by a laser of many levels into resist with a contrast curve."""
+    """A relief that a laser writes, with many levels, into a resist with a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -151,7 +151,7 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A relief exposed by micromirrors in many levels, in resist that spreads its dose."""
+    """A relief that micromirrors expose, with many levels, in a resist that spreads its dose."""
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig

@@ -1,1 +1,1 @@
-"""Heights of whole fields, tile by tile."""
+"""Predict the heights of whole fields, tile by tile."""

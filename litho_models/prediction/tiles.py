@@ -1,4 +1,6 @@
-"""Predict whole fields of any size in tiles, exact for models with a receptive radius, otherwise blended."""
+"""Predict whole fields of any size in tiles; the result is exact for models with a receptive radius,
+otherwise blended.
+"""
 
 from collections.abc import Callable
 
@@ -16,11 +18,11 @@ TILE_PX = 1024
 
 
 def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
-    """Height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
+    """Predict the height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
 
-    A field larger than ``tile_px`` is computed tile by tile, each with the receptive radius around
-    it, which gives the same heights as the whole field at once. A model without a receptive radius
-    predicts the field in its own way.
+    A field larger than ``tile_px`` is computed in tiles, each with the receptive radius around it. The
+    heights are the same as those of the whole field at once. A model without a receptive radius predicts the
+    field in its own way.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -30,7 +32,8 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
 
 
 def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
-    """Height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x - 2r), µm.
+    """Predict the height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x -
+    2r), µm.
 
     Gradients flow to the layout. Tiles of at most ``tile_px`` do not change the result.
 
@@ -57,10 +60,11 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 
 
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
-    """Height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the layout.
+    """Predict the height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the
+    layout.
 
-    The border is less than half the layout. The result is that of ``predict_field`` without its border; if
-    the model allows it, only what the result needs is computed: see ``FrozenSimulator.inside``.
+    The border is less than half the layout. The result equals that of ``predict_field`` without its border.
+    If the model allows it, only what the result needs is computed: see ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
     if reach is None:
@@ -73,10 +77,10 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
 def blend_tiles(
     function: Callable[[Tensor], Tensor], layout_um: Tensor, tile: Tile, border_px: int = 0
 ) -> Tensor:
-    """Weighted mean of ``function`` over overlapping tiles; the weights at each pixel sum to one.
+    """Average ``function`` over overlapping tiles with weights that sum to one at each pixel.
 
-    The first tile starts ``overlap_px`` before the field, whose outermost pixels are continued, so
-    that every pixel of the field has its full set of tiles.
+    The first tile starts ``overlap_px`` before the field, whose outermost pixels are continued there, so that
+    every pixel of the field lies in its full set of tiles.
 
     Args:
         function: maps tiles (b, 1, T, T) to their heights.
@@ -91,7 +95,7 @@ def blend_tiles(
     size, overlap = tile
     stride = size - overlap
     window = blending_window(tile, layout_um)
-    # All positions count from the first tile that a whole field would have.
+    # All positions are counted from the first tile that a whole field would have.
     (top, bottom), (left, right) = (
         (overlap + border_px, overlap + length - border_px) for length in layout_um.shape[-2:]
     )
@@ -124,7 +128,8 @@ def blend_tiles(
 
 
 def blending_window(tile: Tile, like: Tensor) -> Tensor:
-    """Weight of each pixel of a tile, (T, T): sin² ramps over the overlap, which neighbours complete to one.
+    """Return the weight of each pixel of a tile, (T, T): a sin² ramp over the overlap; neighbouring weights
+    add up to one.
 
     Raises:
         InputError: an overlap of more than half a tile.
@@ -141,7 +146,7 @@ def blending_window(tile: Tile, like: Tensor) -> Tensor:
 
 
 def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:
-    """Height that the model expects for one scan, float32 (ny, nx) µm; no gradients."""
+    """Predict the height of one scan with a model, float32 (ny, nx) µm, without gradients."""
     device = next(model.parameters(), torch.empty(0)).device
     with torch.no_grad():
         layout = torch.from_numpy(scan.layout_um)[None, None].to(device)

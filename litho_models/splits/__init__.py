@@ -1,1 +1,1 @@
-"""Division of scans into training, held-out and locked ones."""
+"""Divide scans into training, held-out and locked scans."""

@@ -1,6 +1,6 @@
-"""Divide scans into training and held-out ones; ``litho_data.store.lock_box`` chooses the locked ones.
+"""Divide scans into training and held-out scans; ``litho_data.store.lock_box`` chooses the locked scans.
 
-The unit is the whole scan, because the quadrants of one scan share its datum, tip and day. Every
+The unit of the split is the whole scan, because the quadrants of one scan share its datum, tip and day. Every
 choice follows from a hash of the ids and a seed, so the same ids always give the same split.
 """
 
@@ -21,7 +21,7 @@ QUADRANTS = (0, 1, 2, 3)
 
 
 class Split(Record):
-    """The division of a dataset; ``lock_box``: its locked scans, scored or not."""
+    """The division of a dataset; ``lock_box`` contains its locked scans, scored or not."""
 
     kind: str
     folds: int = 0
@@ -29,9 +29,9 @@ class Split(Record):
 
 
 class ScoredSplit(Split):
-    """The scored scans; ``lock_box_opened``: whether any locked scan was scored.
+    """The scored scans; ``lock_box_opened`` says whether any locked scan was scored.
 
-    ``first_folds``: how many of the folds were made; None for all.
+    ``first_folds`` is the number of folds that were made; None stands for all.
     """
 
     seed: int = 0
@@ -49,7 +49,7 @@ class Crop:
     quadrant: int
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns of the quadrant in an array of ``shape`` (ny, nx)."""
+        """Return the rows and columns of the quadrant in an array of ``shape`` (ny, nx)."""
         half_y, half_x = shape[0] // 2, shape[1] // 2
         row, column = divmod(self.quadrant, 2)
         return (
@@ -60,7 +60,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class Fold:
-    """Scans to learn from and scans to predict; ``locked`` marks the opening of the lock box."""
+    """The scans to learn from and the scans to predict; ``locked`` marks the opening of the lock box."""
 
     number: int
     training: list[PrintedScan]
@@ -77,7 +77,8 @@ def plan_folds(
     seed: int = 0,
     open_lock_box: bool = False,
 ) -> list[Fold]:
-    """The folds of a split; scans of the lock box are in none of them, except for ``paper``, which leaks.
+    """Return the folds of a split. No fold contains scans of the lock box, except in the split ``paper``,
+    which leaks.
 
     Raises:
         InputError: too few scans, no lock box to open, or an unknown split.
@@ -132,7 +133,7 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
 
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
-    """One fold per print, in the order of the print names: all its scans are held out.
+    """Return one fold per print, in the order of the print names; each fold holds out all scans of its print.
 
     Raises:
         InputError: fewer than two prints.
@@ -148,9 +149,10 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 
 
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
-    """The crops held out in one random draw over quadrants, as in the paper (24 of 96).
+    """Return the crops held out in one random draw over quadrants, as in the paper (24 of 96).
 
-    Quadrants of one scan land on both sides, so this leaks; for comparison with the paper only.
+    Quadrants of one scan fall on both sides, so this split leaks; use it only for comparison with the
+    paper.
     """
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
@@ -160,7 +162,9 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Training scans set aside to choose the checkpoint: ``count``, but at most a quarter of all."""
+    """Choose training scans that are set aside to select the checkpoint: ``count``, but at most a quarter of
+    all.
+    """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
     return sorted(shuffled[: min(count, len(ids) // 4)])
