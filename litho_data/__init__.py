@@ -1,8 +1,8 @@
-"""Raw AFM files and layouts in, a dataset with provenance out.
+"""Turn raw AFM files and layouts into a dataset with provenance.
 
-One scan: ``read_scan`` → ``level_scan`` → ``register_scan`` → ``resample_to_layout``. A whole dataset:
-``build_dataset`` from a card, then ``open_store``. ``fetch`` gets the files of a known dataset; ``simulate``
-makes those of a virtual one.
+For one scan, call ``read_scan`` → ``level_scan`` → ``register_scan`` → ``resample_to_layout``. For a whole
+dataset, call ``build_dataset`` with a card, then ``open_store``. ``fetch`` gets the files of a known dataset,
+and ``simulate`` makes those of a virtual one.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""One height map as an instrument recorded it, with all that the file says about it."""
+"""One height map as an instrument recorded it, with all that its file says about it."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -83,18 +83,18 @@ class Scan:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(ny, nx) in pixels."""
+        """Return the shape (ny, nx) in pixels."""
         return self.height_um.shape[0], self.height_um.shape[1]
 
     def require_pitch(self) -> YX:
-        """The pitch (y, x) in µm, for every operation that needs lateral lengths.
+        """Return the pitch (y, x) in µm, which every operation with lateral lengths needs.
 
         Raises:
             InputError: the pitch is unknown.
         """
         if self.pitch_um is None:
             raise InputError(
-                f"scan {self.source or self.name} carries no pixel pitch",
+                f"scan {self.source or self.name} has no pixel pitch",
                 wanted="a pitch in µm",
                 hint="give the field size, for example size_um = [54.0, 54.0]",
             )
@@ -102,5 +102,5 @@ class Scan:
 
     @property
     def grid(self) -> PixelGrid:
-        """The sampling geometry; raises InputError if the pitch is unknown."""
+        """Return the sampling geometry, or raise InputError if the pitch is unknown."""
         return PixelGrid(self.shape, self.require_pitch())

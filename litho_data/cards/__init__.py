@@ -1,1 +1,1 @@
-"""Dataset cards: descriptions of the raw files of a dataset, their location and their fields."""
+"""Dataset cards, which describe the raw files of a dataset, their location and their fields."""

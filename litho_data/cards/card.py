@@ -18,7 +18,7 @@ from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 
-# Longest value that a message shows, characters.
+# Longest value that a message shows, in characters.
 _LONGEST = 80
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
@@ -45,7 +45,7 @@ def check_card(content: dict[str, Any], what: str) -> Card:
 
 
 def with_tip(card: Card, tip: float | str) -> Card:
-    """The card with another ``process.tip``.
+    """Return the card with another ``process.tip``.
 
     Raises:
         InputError: a tip that is neither a positive number nor ``blind``, or a card of micrographs, which
@@ -91,7 +91,7 @@ def _file_patterns(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def _inside(value: str) -> str:
-    """A relative path that stays in the data folder, with either kind of separator."""
+    """Check that a path is relative and stays in the data folder; both kinds of separator are accepted."""
     parts = PurePosixPath(value.replace("\\", "/")).parts
     leaves = not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value)
     if leaves or not value.isprintable():
@@ -120,9 +120,9 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 class LayoutFiles(Record):
     """The layout files.
 
-    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
-    255 / (levels - 1) where white is the highest level. ``average_px``: the files are black-and-white
-    pictures; each square of this many pixels a side becomes one pixel of the layout, whose level is the
+    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as 255 /
+    (levels - 1) if white is the highest level. If ``average_px`` is set, the files are black-and-white
+    pictures. Each square of this many pixels a side becomes one pixel of the layout, whose level is the
     number of white pixels in the square.
     """
 
@@ -143,14 +143,13 @@ class LayoutFiles(Record):
 
 
 class ScanFiles(Record):
-    """The scan files. ``size_um`` is (y, x), for formats that do not carry it.
+    """The scan files. ``size_um`` is (y, x), for formats that do not state the size.
 
-    ``instrument``: the kind of microscope. The files of ``sem``, a scanning electron microscope, are pictures
-    of a film of the layout's full height; the build measures the edges of the film.
+    ``instrument`` is the kind of microscope. Files of a scanning electron microscope (``sem``) are pictures
+    of a film of the layout's full height; the build measures the edges of this film.
 
-    ``levelled``: whether the build takes the heights from the files without levelling them.
-    ``missing``: numbers and words that mark pixels without a measurement; an empty list says that there are
-    none.
+    ``levelled`` says that the build takes the heights from the files without levelling them. ``missing``
+    contains numbers and words that mark pixels without a measurement; an empty list says that there are none.
     """
 
     files: FilePatterns
@@ -175,7 +174,7 @@ class ScanFiles(Record):
 
 
 class Process(Record):
-    """The processing of raw scans: a levelling recipe file, a registration model, a tip.
+    """How raw scans are processed: a levelling recipe file, a registration model, a tip.
 
     Without ``level``, the layout-aware plane is subtracted from scans that are not level yet. ``tip`` is the
     radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
@@ -187,14 +186,14 @@ class Process(Record):
 
 
 class Ids(Record):
-    """The meaning of ids: a regular expression for the whole id, and a CSV table with further facts."""
+    """What the ids mean: a regular expression for the whole id, and a CSV table with further facts."""
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None
     table: InsidePath | None = None
 
 
 class Standard(Record):
-    """A scan of something of known size; it is read like the card's scans unless stated here."""
+    """A scan of a standard of known size; it is read like the card's scans unless stated here."""
 
     file: InsidePath
     uncertainty_um: Uncertainty
@@ -218,7 +217,7 @@ class Step(Standard):
 
 
 class Calibration(Record):
-    """The standards that give the scales of the microscope: gratings along x and y, a step."""
+    """The standards that give the scales of the microscope: gratings along x and y, and a step."""
 
     x: Grating | None = None
     y: Grating | None = None
@@ -234,7 +233,7 @@ class Calibration(Record):
 class Write(Record):
     """Facts about the writing of a field; missing facts are assumed, and labelled as assumptions.
 
-    ``surround``: what lies around a printed field, the bare substrate or more of the print.
+    ``surround`` says what lies around a printed field: the bare substrate or more of the print.
     """
 
     slow_axis: Literal["x", "y"] | None = None
@@ -295,7 +294,7 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":
-        # A message of our own validators; for a table it already names the key.
+        # This is a message of our own validators; for a table it already names the key.
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
         return InputError(f"{what}: {key}{shown}: {cause}")
@@ -314,7 +313,7 @@ def _shown(value: object) -> str:
 
 
 def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:
-    """The model that the keys of an error location lead to."""
+    """Return the model to which the keys of an error location lead."""
     model: type[BaseModel] = Card
     for part in location:
         annotation = model.model_fields[str(part)].annotation

@@ -1,4 +1,4 @@
-"""Getting a known dataset: a file is downloaded once, and used only if its SHA-256 is the registered one."""
+"""Fetch a known dataset: each file is downloaded once, and used only if its SHA-256 is the registered one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     import pooch
 
 CARDS = Path(__file__).parents[1] / "datasets"
-"""The cards that come with the package; in a source checkout a link to the folder beside the packages."""
+"""The cards that come with the package; in a source checkout this is a link to the folder beside the
+packages.
+"""
 
 
 def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
-    """Make sure that all files of a dataset are there and undamaged; returns their folder.
+    """Make sure that all files of a dataset are present and undamaged; return their folder.
 
-    Without ``into``, a folder that is already complete is used: ``$LITHO_DATA_DIR/<name>`` first, then the
+    Without ``into``, a folder that is already complete is used: first ``$LITHO_DATA_DIR/<name>``, then the
     user cache, into which missing files are downloaded. Files with the right hash are not downloaded again,
     so an interrupted fetch resumes.
 
@@ -46,20 +48,22 @@ def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
 
 
 def known_folders(name: str) -> list[Path]:
-    """The folders searched for the files of a dataset: ``$LITHO_DATA_DIR/<name>``, then the user cache."""
+    """Return the folders searched for the files of a dataset: ``$LITHO_DATA_DIR/<name>``, then the user
+    cache.
+    """
     root = os.environ.get("LITHO_DATA_DIR")
     return [*([Path(root) / name] if root else []), cache_folder(name)]
 
 
 def cache_folder(name: str) -> Path:
-    """Folder of a dataset in the user cache."""
+    """Return the folder of a dataset in the user cache."""
     import pooch
 
     return Path(pooch.os_cache("litholoop")) / name
 
 
 def find_card(dataset: str | Path) -> Path:
-    """Path of a card, from a path to a ``.toml`` file or the name of one of the project's cards.
+    """Return the path of a card, from a path to a ``.toml`` file or the name of one of the project's cards.
 
     Raises:
         InputError: no card of that name.
@@ -73,7 +77,7 @@ def find_card(dataset: str | Path) -> Path:
 
 
 def known_cards() -> dict[str, Path]:
-    """The project's cards by name; files like ``<name>.split.toml`` are no cards."""
+    """Return the project's cards by name; files like ``<name>.split.toml`` are not cards."""
     return {path.stem: path for path in sorted(CARDS.glob("*.toml")) if "." not in path.stem}
 
 
@@ -100,7 +104,7 @@ def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
 
 
 def _missing(folder: Path, registry: pooch.Pooch) -> list[str]:
-    """Registered files that are missing in the folder or have another hash."""
+    """Return the registered files that are missing in the folder or have another hash."""
     hashes = registry.registry.items()
     return [
         file

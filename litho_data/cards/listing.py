@@ -1,4 +1,4 @@
-"""The printed fields of a card: files found, paired by id, and described by the card's table."""
+"""The printed fields of a card: its files are found, paired by id, and described by the card's table."""
 
 import glob
 import json
@@ -16,7 +16,7 @@ from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, rea
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
-# Longest time that a card's expression may take to match, in a process of its own.
+# Longest time that a card's expression may take to match, in a separate process.
 _LONGEST_S = 10.0
 _MATCH = """
 import json, re, sys
@@ -29,9 +29,9 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 class PrintedField:
     """One field to build: its files and what the card says about it.
 
-    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` the reading options
-    that the table gives instead of the card, ``full_scale_um`` the height of the largest integer of an image
-    scan. ``layout`` may be None only for a reference scan (``use`` not dataset).
+    ``columns`` contains the optional numbers (µm, dose) and words of the table. ``read`` contains the reading
+    options that the table gives instead of the card, and ``full_scale_um`` the height of the largest integer
+    of an image scan. ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
     """
 
     id: str
@@ -47,7 +47,7 @@ class PrintedField:
 
 @dataclass(frozen=True)
 class LeftAside:
-    """Unused files, of an id with only one file (``unpaired``) or of a refused id."""
+    """Unused files: of an id with only one file (``unpaired``), or of a refused id."""
 
     id: str
     files: tuple[Path, ...]
@@ -67,7 +67,7 @@ class Listing:
     assumptions: tuple[str, ...]
 
     def relative(self, path: Path) -> str:
-        """The path as it is recorded: relative to the data folder, with forward slashes."""
+        """Return the path as the record states it: relative to the data folder, with forward slashes."""
         return path.relative_to(self.data_dir).as_posix()
 
 
@@ -161,18 +161,18 @@ def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Pa
 
 
 def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
-    """The patterns of a card's entry, one or several."""
+    """Return the patterns of a card's entry, which may be one or several."""
     return (files,) if isinstance(files, str) else tuple(files)
 
 
 def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
-    """The files of each id, by one pattern or several; ``*`` stands for any part of a name."""
+    """Find the files of each id, by one pattern or several; ``*`` stands for any part of a name."""
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):
         before, *rest = (
             "[^/]*".join(re.escape(piece) for piece in part.split("*")) for part in pattern.split("{id}")
         )
-        # The first position captures the id, the others must repeat it.
+        # The first position captures the id, and the others must repeat it.
         match = re.compile(before + "(?P<id>[^/]+)" + "(?P=id)".join(rest))
         parts = pattern.replace("{id}", "*").split("*")
         for name in sorted(glob.glob("*".join(glob.escape(part) for part in parts), root_dir=folder)):
@@ -185,7 +185,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 def _refusal(
     scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, str]], card: Card
 ) -> str:
-    """Why an id cannot be used although it has all files; empty if it can be used."""
+    """Say why an id cannot be used although it has all files; return an empty text if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may hold letters, digits, space and ._+- only"
     if print_id is None and use == "dataset":
@@ -196,7 +196,7 @@ def _refusal(
 
 
 def leads_out(files: tuple[Path, ...], folder: Path) -> str:
-    """Why links cannot be used that lead out of the data folder, which is all that the card describes."""
+    """Say why links that lead out of the data folder cannot be used: the card describes only this folder."""
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
 
@@ -213,7 +213,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
-    """Facts that the card does not state and that are assumed for the effects that need them."""
+    """Return the facts that the card does not state and that are assumed for the effects that need them."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")
@@ -227,10 +227,11 @@ def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[st
 
 
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
-    """The group ``print`` of the expression for each whole id, None where it does not match.
+    """Return the group ``print`` of the expression for each whole id; None where the expression does not
+    match.
 
-    Without an expression every id is a print of its own. Matching nested repetitions can take for ever and
-    cannot be interrupted, so an expression with any repetition runs in a process of its own.
+    Without an expression every id counts as a print of its own. Matching nested repetitions can take forever
+    and cannot be interrupted, so an expression with any repetition runs in a separate process.
 
     Raises:
         InputError: no result after 10 s.
@@ -240,7 +241,7 @@ def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
     if not set("*+{?") & set(pattern.replace("(?", "(")):
         return [found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)]
     try:
-        # Isolated and without site packages, which would take ten times as long.
+        # The process is isolated and has no site packages, which would take ten times as long.
         done = subprocess.run(
             [sys.executable, "-ISc", _MATCH],
             input=json.dumps([pattern, list(ids)]),

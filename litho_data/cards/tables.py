@@ -1,4 +1,4 @@
-"""The two files that a card may refer to: the table of the ids, and the full scales of images."""
+"""Read the two files to which a card may refer: the table of the ids, and the full scales of images."""
 
 import csv
 import json
@@ -20,17 +20,17 @@ from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
 READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
-"""What the table may say about single scans; it replaces the card's ``[scan]``."""
+"""What the table may say about single scans; these entries replace those in the card's ``[scan]``."""
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
 _NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")
 _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, str]]:
-    """Rows of a card's CSV table by id, without empty cells; all other cells have been checked.
+    """Return the rows of a card's CSV table by id, without empty cells, after checking all other cells.
 
-    It reads what spreadsheets write in any language: cells separated by commas, semicolons or tabs, text that
-    may be UTF-16, and decimal commas where commas do not separate cells.
+    The reader accepts what spreadsheets write in any language: cells separated by commas, semicolons or tabs,
+    text that may be UTF-16, and decimal commas if commas do not separate cells.
 
     Raises:
         InputError: an unreadable file, an unknown column, an id that is no plain name, or a cell of the wrong
@@ -81,7 +81,9 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         raise InputError(f"{what}: unit", got=repr(row["unit"]), wanted="a length, such as nm")
     if "size_um" in row and not size_of(row["size_um"]):
         raise InputError(
-            f"{what}: size_um", got=repr(row["size_um"]), wanted="one side in µm, or y x x: 54 x 27"
+            f"{what}: size_um",
+            got=repr(row["size_um"]),
+            wanted="one side in µm, or height x width, such as 54 x 27",
         )
     for name, known in (
         ("format", ("auto", *formats())),
@@ -92,7 +94,9 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
 
 
 def size_of(text: str) -> YX | None:
-    """(y, x) from a cell with one side, or both sides separated by ``x``; None if it has neither."""
+    """Read (y, x) from a cell with one side, or with both sides separated by ``x``; return None if it has
+    neither.
+    """
     sides = [one.strip() for one in re.split("[x×]", text)]
     if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):
         return None
@@ -107,7 +111,7 @@ def _is_finite(text: str) -> bool:
 
 
 def read_full_scales(path: Path) -> dict[str, float]:
-    """Height of the largest grey value per file name or id, from a JSON object in metres, as µm.
+    """Read the height of the largest grey value, as µm, per file name or id, from a JSON object in metres.
 
     Raises:
         InputError: no such file, no JSON object, or a value that is not a positive number.

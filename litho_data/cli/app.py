@@ -1,4 +1,4 @@
-"""``litho-data``: every command parses arguments and calls one public function."""
+"""The command line ``litho-data``: every command parses arguments and calls one public function."""
 
 import sys
 from enum import StrEnum
@@ -42,7 +42,7 @@ def fetch(
     name: Annotated[str, argument("a dataset of this project, e.g. neural-lithography, or a card's path")],
     into: Annotated[Path | None, option("folder to fill; by default the user cache")] = None,
 ) -> None:
-    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256.
+    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; every SHA-256 is checked.
 
     Example: litho-data fetch neural-lithography
     """
@@ -71,10 +71,10 @@ def build(
         ),
     ] = None,
 ) -> None:
-    """Read, level, register and store all scans of a card; writes the store and a report beside it.
+    """Read, level, register and store all scans of a card; write the store and a report beside it.
 
-    With --suggest nothing is built: levelling recipes are compared on three scans, and the best is written
-    beside the card, with a card that names it.
+    With --suggest nothing is built: levelling recipes are compared on three scans. The best is written beside
+    the card, with a card that names it.
 
     Example: litho-data build prints/card.toml --out prints.zarr --workers 2
     """

@@ -1,4 +1,4 @@
-"""Commands `masks` and `simulate`: parse arguments, call one function, print where the result is."""
+"""The commands `masks` and `simulate`: parse arguments, call one function, print where the result is."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +52,7 @@ def masks(
         ),
     ] = False,
 ) -> None:
-    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to add scans to.
+    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to which scans can be added.
 
     Example: litho-data masks --count 24 --levels 13 --out prints
     """
@@ -116,7 +116,8 @@ def simulate(
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
     ] = False,
 ) -> None:
-    """The virtual fab: print layouts, scan the prints, and write the files a laboratory would deliver.
+    """Simulate printer and microscope: print layouts, scan the prints, and write the files a laboratory would
+    deliver.
 
     Example: litho-data simulate --preset demo --knob laser-drift=0.05 --out fab
     """
@@ -132,7 +133,9 @@ def simulate(
 
     if (plan is None) != (fab is None):
         raise InputError(
-            "--plan and --fab", got="one of them", wanted="both: the plan to print and the fab that prints it"
+            "--plan and --fab",
+            got="only one of the two",
+            wanted="the plan to print, and the fab that prints it",
         )
     shaped = any(value is not None for value in (count, size_px, write_field_um))
     if plan is not None and fab is not None:

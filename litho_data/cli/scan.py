@@ -1,4 +1,4 @@
-"""``litho-data level`` and ``litho-data inspect``: one scan, any supported format."""
+"""The commands ``litho-data level`` and ``inspect``: work on one scan in any supported format."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ _READING: dict[str, Any] = {
 
 
 def reads_scans(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options that say how to read a scan; it gets them as ``how``, for ``read_scan``."""
+    """Give a command the options that say how to read a scan; the command receives them as ``how``, for
+    ``read_scan``.
+    """
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -61,7 +63,7 @@ def level(
     out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     how: Mapping[str, Any],
 ) -> None:
-    """Level one scan; writes the levelled heights, the removed surface and a record beside them.
+    """Level one scan; write the levelled heights, the removed surface and a record beside them.
 
     Example: litho-data level P11.gwy --recipe recipe.toml --out P11.gsf
     """

@@ -1,4 +1,4 @@
-"""``litho-data tip``: the tip of the microscope from its own scans."""
+"""The command ``litho-data tip``: estimate the tip of the microscope from its own scans."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tip(
 ) -> None:
     """Estimate the radius of the tip, or its upper limit, and the pixels that it may not have touched.
 
-    The surface in --maps is the highest that explains the image.
+    The surface in --maps is the highest surface that explains the image.
 
     Example: litho-data tip P11.gwy P12.gwy --maps maps
     """

@@ -1,1 +1,1 @@
-"""The common part of the three command lines: settings as options, progress, errors of one line."""
+"""What the three command lines share: settings as options, progress, and errors of one line."""

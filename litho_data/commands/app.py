@@ -1,4 +1,4 @@
-"""The common part of the three command lines: settings, exit codes, and errors of one line."""
+"""What the three command lines share: settings, exit codes, and errors of one line."""
 
 import errno
 import functools
@@ -22,12 +22,14 @@ UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """An option of a command: its help, its names if not the default ones, and further arguments of typer."""
+    """Make an option of a command from its help, its names if they are not the default ones, and further
+    arguments of typer.
+    """
     return typer.Option(*names, help=help, **more)
 
 
 def argument(help: str) -> Any:
-    """An argument of a command."""
+    """Make an argument of a command."""
     return typer.Argument(help=help)
 
 
@@ -79,7 +81,7 @@ def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> 
 
 
 def keyword(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
-    """A parameter of a command that typer turns into an option."""
+    """Make a parameter of a command that typer turns into an option."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -96,7 +98,7 @@ def takes_more(
 
 
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that hides some of its options ``--help-all``, which shows them."""
+    """Give a command that hides some of its options the option ``--help-all``, which shows them."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -107,12 +109,12 @@ def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def new_app(help_text: str) -> typer.Typer:
-    """A typer application with the settings of this project."""
+    """Make a typer application with the settings of this project."""
 
     def options(
         context: typer.Context,
         version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
-        # run_app removes it from the command line before parsing; declared here for the help.
+        # This option is declared only for the help: run_app removes it from the command line before parsing.
         plugin: Annotated[
             list[str] | None,
             option("Load a Python file that registers something; works with every command.", OPTION),
@@ -127,13 +129,13 @@ def new_app(help_text: str) -> typer.Typer:
             typer.echo(context.get_help())
             raise typer.Exit(2)
 
-    # Without invoke_without_command, --version alone would fail for want of a command.
+    # Without invoke_without_command, --version alone would fail because no command is given.
     return typer.Typer(
         help=help_text,
         callback=options,
         invoke_without_command=True,
         pretty_exceptions_enable=False,
-        # Boxes would leave only a third of an 80-character line to the help of an option.
+        # Boxes would leave only a third of an 80-character line for the help of an option.
         rich_markup_mode=None,
     )
 
@@ -145,7 +147,7 @@ def run_app(app: typer.Typer, name: str) -> None:
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            # Not every terminal has a µ.
+            # Not every terminal can show µ.
             stream.reconfigure(errors="replace")
     try:
         with running_command(command_line(name)), never_silent(name):
@@ -153,7 +155,8 @@ def run_app(app: typer.Typer, name: str) -> None:
             load_plugins(files)
             code = app(words, prog_name=name, standalone_mode=False)
     except BrokenPipeError:
-        # The reader of the output, such as `head`, has closed it; Python would complain at exit.
+        # The reader of the output, such as `head`, has closed it; without this, Python would complain at
+        # exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except UsageError as error:
@@ -170,15 +173,15 @@ def run_app(app: typer.Typer, name: str) -> None:
 
 
 def _not_allowed(error: Exception) -> InputError | None:
-    """What the system or the input did not allow, in words; None for a defect of this project."""
-    # PyTorch and safetensors raise errors of their own for it.
+    """Say in words what the system or the input did not allow; return None for a defect of this project."""
+    # PyTorch and safetensors raise their own errors for a full disk.
     text = str(error)
     if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
         got = text.partition("\n")[0][:_LONGEST]
         return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
     if isinstance(error, OSError):
         what = f"cannot use {error.filename}" if error.filename else "the system refuses"
-        # NumPy does not say why it wrote less than all.
+        # NumPy does not say why it wrote only a part.
         code = errno.ENOSPC if text.endswith(" written") else error.errno or 0
         return InputError(what, got=error, hint=_WAYS_OUT.get(code, _AGAIN))
     if "Symlink loop" in text:
@@ -193,7 +196,7 @@ def _not_allowed(error: Exception) -> InputError | None:
 
 
 def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
-    """Typer's complaint about a command line that it cannot parse, in this project's words.
+    """Express Typer's complaint about a command line that it cannot parse in this project's words.
 
     Args:
         error: a ``UsageError``.
@@ -222,7 +225,7 @@ def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
 
 
 def _given(options: Sequence[str], words: Sequence[str]) -> str | None:
-    """The value that follows an option on the command line; None for an argument."""
+    """Return the value that follows an option on the command line; return None for an argument."""
     for word, value in zip(words, [*words[1:], None], strict=True):
         name, equals, rest = word.partition("=")
         if name in options:

@@ -1,4 +1,4 @@
-"""The command line that results record, and a progress bar on stderr."""
+"""Record the command line for results, and show a progress bar on stderr."""
 
 import shlex
 import sys
@@ -12,9 +12,9 @@ from typing import TypeVar
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-# Shortest time to estimate from, and shortest remaining time that is reported.
+# Shortest time from which to estimate, and shortest remaining time that is reported.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-# Five seconds, with the time that a command takes to start.
+# Together with the time that a command takes to start, this is five seconds.
 _SILENT_S = 3.0
 _silent = threading.Event()
 
@@ -26,12 +26,12 @@ def run_script(main: Callable[[], T]) -> T:
 
 
 def given_words() -> list[str]:
-    """The words after the program's name on the command line."""
+    """Return the words after the program's name on the command line."""
     return sys.argv[1:]
 
 
 def command_line(program: str | None = None) -> str:
-    """The command that this process was started with; ``program`` by default the script or module."""
+    """Return the command that started this process; ``program`` is by default the script or module."""
     if program is None:
         module = sys.modules["__main__"].__spec__
         started = (
@@ -50,9 +50,9 @@ def progress(
     estimate_of: int | None = None,
     at_once: int = 1,
 ) -> Iterator[T]:
-    """Iterate with a progress bar on stderr; without one if stderr is no terminal.
+    """Iterate with a progress bar on stderr, or without one if stderr is not a terminal.
 
-    If the rest will take more than a minute, one line says how long, as soon as it can be estimated. The
+    If the rest will take more than a minute, one line states the time as soon as it can be estimated. The
     first items include start-up, so they do not count for the estimate unless they take a minute themselves.
 
     Args:
@@ -80,7 +80,9 @@ def progress(
 
 
 def say(what: str) -> None:
-    """Print one line on stderr before the work that it names, so that the user knows what they wait for."""
+    """Print one line on stderr before the work that it names, so that users know what they are waiting
+    for.
+    """
     _silent.clear()
     print(what, file=sys.stderr, flush=True)
 

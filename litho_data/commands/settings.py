@@ -1,4 +1,4 @@
-"""Settings that are stated once: a field of a record holds its default, limits, unit, help and option.
+"""State each setting once: a field of a record contains its default, limits, unit, help and option.
 
 The command lines make their options from these fields, and every field can be changed by its dotted path.
 """
@@ -25,7 +25,7 @@ _LARGEST = 1e15
 def setting(
     default: Any, help: str, *, unit: str = "", option: str | tuple[str, ...] = (), **limits: Any
 ) -> Any:
-    """A field of a settings record.
+    """Make a field of a settings record.
 
     Args:
         default: its value if none is given; ``...`` if it must be given.
@@ -66,7 +66,7 @@ class Leaf:
 
 
 def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[Leaf]:
-    """Every setting of a record and of its parts."""
+    """Yield every setting of a record and of its parts."""
     for name, field in type(settings).model_fields.items():
         value, path = getattr(settings, name), f"{prefix}{name}"
         if isinstance(value, BaseModel):
@@ -76,7 +76,7 @@ def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[L
 
 
 def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> Leaf:
-    """The setting that a field states, at this path and with this value."""
+    """Return the setting that a field states, with this path and value."""
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     return Leaf(
         path=path,
@@ -90,7 +90,7 @@ def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> 
 
 
 def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "setting") -> dict[str, Any]:
-    """Values by dotted path, from nested or dotted keys.
+    """Flatten nested or dotted keys to values by dotted path.
 
     Args:
         settings: a record; every key must be one of its names.
@@ -135,7 +135,7 @@ def _names(part: BaseModel, above: str) -> list[str]:
 
 
 def changed(settings: M, changes: Mapping[str, Any]) -> M:
-    """``settings`` with values by dotted path, checked as a whole.
+    """Return ``settings`` with some values changed by dotted path, checked as a whole.
 
     Raises:
         InputError: an unknown name, or a value that the record does not accept.
@@ -157,7 +157,7 @@ def changed(settings: M, changes: Mapping[str, Any]) -> M:
 
 
 def refused(error: ValidationError) -> InputError:
-    """The error for the first setting that a record does not accept."""
+    """Return the error for the first setting that a record does not accept."""
     first = error.errors()[0]
     where, said = ".".join(map(str, first["loc"])), first["msg"]
     limit = said.removeprefix("Input should be ")
@@ -167,7 +167,7 @@ def refused(error: ValidationError) -> InputError:
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
-    """Values by dotted path, from words ``path=value``; a value is JSON if it parses, otherwise a string.
+    """Parse words ``path=value`` to values by dotted path; a value is JSON if it parses, otherwise a string.
 
     Raises:
         InputError: a word without ``=``, or a repeated path.
@@ -187,7 +187,7 @@ def assigned(words: Iterable[str]) -> dict[str, Any]:
 
 
 def read_settings(path: str | Path) -> dict[str, Any]:
-    """The content of a settings file, TOML or JSON by its suffix.
+    """Read a settings file, TOML or JSON by its suffix.
 
     Raises:
         InputError: no such file, another suffix, or text that is not what the suffix says.

@@ -1,1 +1,1 @@
-"""Ways in and out of a store: releases, and the authors' pair format."""
+"""Move data into and out of a store: releases, and the authors' pair format."""

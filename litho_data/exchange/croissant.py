@@ -1,4 +1,4 @@
-"""The Croissant description of a release: its files, and the columns of its quality table."""
+"""Write the Croissant description of a release: its files, and the columns of its quality table."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ _TYPES = {"i": "sc:Integer", "f": "sc:Float", "b": "sc:Boolean"}
 
 
 def croissant(root: Mapping[str, Any], files: Sequence[Mapping[str, Any]], table: Path) -> dict[str, Any]:
-    """The description as JSON-LD.
+    """Return the description as JSON-LD.
 
     Args:
         root: the crate's entry for the dataset; ``files``: its entries for the files.

@@ -1,7 +1,7 @@
-"""Importing and exporting the authors' pair format; see ``litho_data.readers.pairs`` for its limits.
+"""Import and export the authors' pair format; ``litho_data.readers.pairs`` states its limits.
 
-``mask/<id><q>.tif`` holds levels, ``afm/<id><q>.tif`` heights, with the full scales in metres in
-``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
+``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` heights, and ``src_max_dict.txt`` the full scales in
+metres. q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
 """
 
 import json
@@ -50,7 +50,7 @@ def import_pairs(
 ) -> BuildResult:
     """Build a store from a folder in the pair format; four quadrants of one name become one field.
 
-    Heights are value / 255 · full scale. In the authors' own files they are truncated to the grey value
+    A height is value / 255 · full scale. In the authors' own files, heights are truncated to the grey value
     below, so they are half a grey value (about 2 nm) too low on average.
 
     Args:
@@ -95,7 +95,9 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """Stitch one field; ``quadrants`` maps a quadrant (0: a field in one piece) to the name of its files."""
+    """Stitch one field; ``quadrants`` maps a quadrant (0 for a field in one piece) to the name of its
+    files.
+    """
 
     id: str
     print_id: str
@@ -107,19 +109,19 @@ class PairsJob:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Layouts, then heights, in the order of the quadrants."""
+        """Return the layouts, then the heights, in the order of the quadrants."""
         names = [f"{kind}/{name}" for kind in ("mask", "afm") for name in self.quadrants.values()]
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
-        """Hash of everything that determines the piece."""
+        """Return the hash of everything that determines the piece."""
         operation = OPERATIONS["stitch-pairs"]
         card = self.card.model_dump(mode="json")
         plan = [self.print_id, self.order, card, operation.version, operation.code_sha256, self._params]
         return record_sha256([plan, {name: file_sha256(path) for name, path in self.files.items()}])
 
     def run(self) -> Piece:
-        """The stitched field as a piece."""
+        """Return the stitched field as a piece of a store."""
         chain = Chain()
         chain.run("stitch-pairs", self._params, self.files)
         return chain.piece(
@@ -143,7 +145,7 @@ class PairsJob:
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Files by field and quadrant, and the files without a partner, with the reason."""
+    """Return files by field and quadrant, and the files without a partner, each with the reason."""
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
     unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
@@ -177,12 +179,13 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; returns a note for everything that a scan lost.
+    """Write a store in the pair format; return a note for everything that a scan lost.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 
     Raises:
-        InputError: a store whose fields cannot be cut into quadrants, or a folder with something else in it.
+        InputError: a store whose fields cannot be cut into quadrants, or a folder that contains files of
+            another kind.
     """
     store = open_store(store_path)
     notes: list[str] = []

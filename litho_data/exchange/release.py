@@ -1,4 +1,4 @@
-"""Releasing a store: as one file, or as a folder that describes itself, in RO-Crate and in Croissant."""
+"""Release a store as one file, or as a folder that describes itself in RO-Crate and in Croissant."""
 
 import json
 import zipfile
@@ -13,14 +13,14 @@ from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
 from litho_data.store.read import Store, open_store
 
-# Zip needs a time for every file; with a fixed one, the same store gives the same archive.
+# Zip needs a time for every file; a fixed time makes the same store give the same archive.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
 
 
 def export_zip(store_path: str | Path, out: str | Path) -> Path:
-    """Pack a store into one ``.zarr.zip`` file, which ``open_store`` and zarr read as it is.
+    """Pack a store into one ``.zarr.zip`` file, which ``open_store`` and zarr can read directly.
 
     Raises:
         InputError: no store, or one that is packed already.
@@ -43,14 +43,15 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
     """Write a release folder: the packed store, its quality table, and their descriptions.
 
     ``ro-crate-metadata.json`` names every raw file with its SHA-256, the software of the build, licence and
-    citation; ``croissant.json`` describes the files and the columns of the table.
+    citation. ``croissant.json`` describes the files and the columns of the table.
 
     Raises:
-        InputError: no store, a packed one, one without manifest, or a folder with something else in it.
+        InputError: no store, a packed store, a store without manifest, or a folder that contains files of
+            another kind.
     """
     store = open_store(store_path)
     if "card" not in store.manifest:
-        raise InputError(f"{store_path} carries no manifest", wanted="a store made by litho-data build")
+        raise InputError(f"{store_path} has no manifest", wanted="a store made by litho-data build")
     with whole_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE, _CROISSANT_FILE) as folder:
         packed, table = folder / f"{store.name}.zarr.zip", folder / "quality.csv"
         export_zip(store_path, packed)
@@ -72,7 +73,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def _root(store: Store) -> dict[str, Any]:
-    """The crate's entry for the dataset."""
+    """Return the crate's entry for the dataset."""
     manifest = store.manifest
     card = manifest["card"]
     root: dict[str, Any] = {

@@ -1,7 +1,7 @@
 """How every command that writes a folder states, begins, continues and finishes its result.
 
 A command first states what its result will be: the name of its record, which is written last, and the fields
-of the record that determine it. A folder is then one of these:
+of the record that determine the result. A folder is then one of these:
 
 =========  =======================================  =========================================================
 free       not there, or empty                      it is begun
@@ -10,7 +10,8 @@ finished   the record                               made again or continued, if 
 other      anything else                            refused, and nothing is changed
 =========  =======================================  =========================================================
 
-The law: a command that was stopped after any of its writes and is run again ends with the same result.
+This law holds: if a command is stopped after any of its writes and run again, it ends with the same
+result.
 """
 
 import json
@@ -33,7 +34,7 @@ BEGUN = "begun.json"
 
 @dataclass(frozen=True)
 class Begun:
-    """A folder in which a result grows; ``finished``: the same result was already complete."""
+    """A folder in which a result grows; ``finished`` says that the same result was already complete."""
 
     folder: Path
     finished: bool
@@ -43,9 +44,10 @@ class Begun:
 def growing_folder(
     out: str | Path, record: str, facts: Mapping[str, Any] | None = None, *, holds: str = ""
 ) -> Iterator[Begun]:
-    """A folder whose files appear as they are finished, so that a stopped run can resume.
+    """Yield a folder whose files appear as they are finished, so that a stopped run can resume.
 
-    Other files in a folder that holds this result are left alone. One process at a time writes the folder.
+    Other files in a folder that contains this result are left alone. Only one process at a time writes the
+    folder.
 
     Args:
         out: the folder; made if need be.
@@ -86,7 +88,7 @@ def growing_folder(
 def whole_folder(
     out: str | Path, *holds: str, record: str = "", facts: Mapping[str, Any] | None = None
 ) -> Iterator[Path]:
-    """A folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
+    """Yield a folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
 
     Args:
         out: what will be replaced.
@@ -104,10 +106,10 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str) -> bool:
-    """Whether the same result is begun there already."""
+    """Return whether the same result has already been begun there."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
-    # A process that was stopped before it wrote what it begins has begun nothing.
+    # A process that was stopped before it wrote ``begun.json`` has begun nothing.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
     require_own_folder(folder, record, *[BEGUN] * (own or nothing), *[holds] * bool(holds))
     require_same(folder, begun if own else read_record(folder / record), facts)

@@ -5,12 +5,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _MANY = 12
-# The value found can be of any length.
+# The value found can have any length.
 _LONGEST = 240
 
 
 class InputError(ValueError):
-    """Bad input: the message is one line that says what is wrong, what was found and wanted, and a hint.
+    """Bad input: the message is one line that says what is wrong, what was found and wanted, and gives a
+    hint.
 
     The command lines print it without a traceback and exit with code 2; every other exception is a defect of
     this project. ``got`` may be an exception: the message says why in words.
@@ -29,7 +30,7 @@ class InputError(ValueError):
 
 @contextmanager
 def about(what: str) -> Iterator[None]:
-    """Begin the messages of InputErrors in the block with ``what``."""
+    """Put ``what`` at the beginning of the messages of InputErrors in the block."""
     try:
         yield
     except InputError as error:
@@ -38,7 +39,7 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Guard a block that reads a file that a program wrote and somebody may have changed since.
+    """Guard a block that reads a file written by a program and perhaps changed by somebody since.
 
     Raises:
         InputError: in place of any error about the content: a missing key, a text for a number, no JSON, …
@@ -52,7 +53,7 @@ def damaged(what: str) -> Iterator[None]:
 
 
 def said(error: Exception) -> str:
-    """Why something could not be read, in plain words instead of Python's."""
+    """Say in plain words, instead of Python's, why something could not be read."""
     if isinstance(error, UnicodeDecodeError):
         return "bytes that are no text"
     if isinstance(error, OSError) and error.strerror:
@@ -73,7 +74,7 @@ def require_known(what: str, got: str, known: Iterable[str]) -> None:
 def unknown_name(
     what: str, got: object, known: Iterable[str], hint: str = "", *, also: str = ""
 ) -> InputError:
-    """The error for an unknown name; the hint is the nearest known name, if one is near.
+    """Return the error for an unknown name; the hint is the nearest known name, if one is similar.
 
     Args:
         what: what the name stands for.
@@ -83,7 +84,7 @@ def unknown_name(
     """
     names = list(known)
     near = difflib.get_close_matches(str(got), names)
-    # A screen of names helps nobody who misspelt one of them.
+    # A screen full of names does not help a user who misspelt one of them.
     shown = [] if near and len(names) > _MANY else names
     wanted = " or ".join(filter(None, (", ".join(shown), also)))
     return InputError(

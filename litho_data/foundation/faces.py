@@ -11,26 +11,28 @@ from pathlib import Path
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
-# litho_data does not need it; if it is missing, so are the extras `models` and `design`.
+# litho_data does not need torch; if torch is missing, the extras `models` and `design` are missing too.
 _OF_EXTRAS = "torch"
-# For the OpenMP of GNU, and for that of Intel.
+# The first is for GNU's OpenMP, the second for Intel's.
 _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 
 
 def let_waiting_threads_sleep() -> None:
-    """Call this before torch is loaded: its threads would otherwise spin while they wait for one another.
+    """Let waiting threads of torch sleep; call this before torch is loaded. Otherwise threads spin while they
+    wait for one another.
 
-    Beside one busy process, a spinning pair of threads takes ten times as long. Environment variables that
-    are set already stay as they are.
+    Next to one busy process, a spinning pair of threads takes ten times as long. Environment variables that
+    are already set are not changed.
     """
     for variable, value in _SLEEP.items():
         os.environ.setdefault(variable, value)
 
 
 def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
-    For a package's ``__init__``. Type checkers follow its imports; Python reads only their names::
+    Use it in a package's ``__init__``. Type checkers follow the imports of the file, while Python reads only
+    their names::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Write files and folders that appear completely or not at all."""
 
 import contextlib
 import errno
@@ -16,7 +16,8 @@ from litho_data.foundation.errors import InputError
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, of its suffix; it replaces ``path`` only if the block succeeds.
+    """Yield a temporary path beside ``path``, with its suffix; the file replaces ``path`` only if the block
+    succeeds.
 
     Raises:
         InputError: ``path`` is a folder, or cannot be written.
@@ -74,7 +75,9 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
     """
     target = Path(path)
     if target.is_symlink() and not target.exists():
-        raise InputError(f"cannot write {target}", got="a link that leads nowhere", wanted="a folder's place")
+        raise InputError(
+            f"cannot write {target}", got="a link that leads nowhere", wanted="the path of a folder"
+        )
     work = _work(target)
     while True:
         with writable(target):
@@ -97,7 +100,9 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
 
 
 def publish(new: Path, path: str | Path) -> None:
-    """Rename a finished folder to ``path``, within ``unfinished``, which keeps an older one until then."""
+    """Rename a finished folder to ``path``; call this within ``unfinished``, which keeps an older folder
+    until then.
+    """
     target = Path(path)
     if target.exists():
         target.replace(_work(target) / "old")
@@ -122,7 +127,7 @@ def _work(target: Path) -> Path:
 
 
 def _put_back(work: Path, target: Path) -> None:
-    """Put back an older folder that was moved aside for a new one that never came."""
+    """Put back an older folder that was moved aside for a new folder that never came."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.replace(target)
@@ -130,10 +135,10 @@ def _put_back(work: Path, target: Path) -> None:
 
 
 def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
-    """The file, open for appending and locked; the advisory lock ends with the file or the process.
+    """Open the file for appending and lock it; the advisory lock ends with the file or the process.
 
     Raises:
-        InputError: another process, which is writing ``target``, holds the lock.
+        InputError: another process is writing ``target`` and holds the lock.
     """
     stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
     if not _lock(stream, wait):
@@ -143,7 +148,7 @@ def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
 
 
 def _lock(stream: IO[str], wait: bool = False) -> bool:
-    """Take the lock and say whether that worked; True as well on a system without such locks."""
+    """Take the lock and return whether that worked; return True also on a system without such locks."""
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -162,7 +167,7 @@ def _remove_unless_held(left: Path) -> None:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file.
+    """Return the text of a file.
 
     Raises:
         OSError: the file cannot be read, or is a pipe, which would keep its reader waiting.
@@ -174,7 +179,7 @@ def read_text(path: Path) -> str:
 
 
 def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> Any:
-    """The content of a text file, parsed as TOML or JSON.
+    """Read a text file and parse it as TOML or JSON.
 
     Raises:
         InputError: no such file, or text that does not parse; the message begins with ``what``.
@@ -187,7 +192,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """For writing the first files of an output: an error of the file system becomes an InputError."""
+    """Turn an error of the file system into an InputError while the first files of an output are written."""
     try:
         yield
     except OSError as error:

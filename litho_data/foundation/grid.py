@@ -1,4 +1,4 @@
-"""The sampling geometry that travels with every array: one type for all three packages."""
+"""The sampling geometry that belongs to every array: one type for all three packages."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ class PixelGrid:
 
     @classmethod
     def square(cls, shape: tuple[int, int], pitch_um: float) -> PixelGrid:
-        """A grid of square pixels with its corner at the origin."""
+        """Make a grid of square pixels with its corner at the origin."""
         return cls((int(shape[0]), int(shape[1])), (float(pitch_um), float(pitch_um)))
 
     @property
     def size_um(self) -> YX:
-        """(y, x) extent from edge to edge, µm."""
+        """Return the (y, x) extent from edge to edge, µm."""
         return self.shape[0] * self.pitch_um[0], self.shape[1] * self.pitch_um[1]
 
     @property
     def y_um(self) -> Array:
-        """Row centres, shape (ny,), µm."""
+        """Return the row centres, shape (ny,), µm."""
         return self.origin_um[0] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um[0]
 
     @property
     def x_um(self) -> Array:
-        """Column centres, shape (nx,), µm."""
+        """Return the column centres, shape (nx,), µm."""
         return self.origin_um[1] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um[1]

@@ -1,4 +1,4 @@
-"""SHA-256 of what determines a result: files, arrays, plain data, source code."""
+"""Compute the SHA-256 of what determines a result: files, arrays, plain data, source code."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ _BLOCK_BYTES = 1 << 20
 
 
 def file_sha256(path: str | Path) -> str:
-    """Hex SHA-256 of the bytes of one file."""
+    """Return the hex SHA-256 of the bytes of one file."""
     digest = hashlib.sha256()
     with open(path, "rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
@@ -23,7 +23,8 @@ def file_sha256(path: str | Path) -> str:
 
 
 def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
-    """Hash of a decoded array: type, shape, values, unit and dimension names, however it is chunked.
+    """Return the hash of a decoded array: of type, shape, values, unit and dimension names, whatever its
+    chunks.
 
     Args:
         array: any numeric or boolean array; every NaN counts as the same NaN.
@@ -43,17 +44,19 @@ def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
 
 
 def record_sha256(record: Any) -> str:
-    """Hash of plain data (dicts, lists, strings, numbers): SHA-256 of its canonical JSON."""
+    """Return the hash of plain data (dicts, lists, strings, numbers): the SHA-256 of its canonical JSON."""
     return hashlib.sha256(canonical_json(record).encode()).hexdigest()
 
 
 def canonical_json(record: Any) -> str:
-    """JSON with sorted keys and no spaces: equal data, equal text."""
+    """Return JSON with sorted keys and no spaces, so that equal data give equal text."""
     return json.dumps(record, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def source_sha256(*paths: Path) -> str:
-    """Hash of source files; a folder stands for all of Python and TOML below it, in sorted order."""
+    """Return the hash of source files; a folder stands for all Python and TOML files below it, in sorted
+    order.
+    """
     digest = hashlib.sha256()
     for path in paths:
         for file in sorted([*path.rglob("*.py"), *path.rglob("*.toml")]) if path.is_dir() else [path]:

@@ -1,4 +1,4 @@
-"""The gate for names: a name from a received file that may become part of a path must be plain."""
+"""Check names: a name from a received file that may become part of a path must be plain."""
 
 import re
 from typing import Annotated
@@ -7,13 +7,15 @@ from pydantic import AfterValidator
 
 from litho_data.foundation.errors import InputError
 
-# A file system takes 255 bytes, of which suffixes need some.
+# A file system allows 255 bytes, of which suffixes need some.
 _LONGEST_BYTES = 200
 _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether the text is a file name on every system, and never a path, a hidden file or an option."""
+    """Return whether the text is a file name on every system, and never a path, a hidden file or an
+    option.
+    """
     return (
         isinstance(name, str)
         and 0 < len(name.encode("utf-8", "replace")) <= _LONGEST_BYTES
@@ -26,7 +28,7 @@ def is_plain_name(name: object) -> bool:
 
 
 def require_plain_name(what: str, name: str) -> str:
-    """The name itself.
+    """Return the name if it is plain.
 
     Raises:
         InputError: as part of a path, the name could lead somewhere else.

@@ -1,6 +1,6 @@
 """Rules for ``--out`` of every command, which only ever replaces its own older result.
 
-A missing or empty folder is accepted. If the folder holds an earlier run of the same command on the same
+A missing or empty folder is accepted. If the folder contains an earlier run of the same command on the same
 subject (dataset, model, design) with the same settings, the run resumes or its result is made again. Anything
 else is refused, and nothing is changed.
 """
@@ -16,14 +16,14 @@ from litho_data.foundation.files import read_text
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
-    """Accept a path that is free, an empty folder, or a folder with nothing in it but an older result.
+    """Accept a free path, an empty folder, or a folder that contains nothing but an older result.
 
     Args:
         path: where the result will be.
         holds: names, or patterns of names, of everything that such a result holds.
 
     Raises:
-        InputError: the current folder, a file, or a folder with something else in it, which the message
+        InputError: the current folder, a file, or a folder with anything else in it, which the message
             names.
     """
     folder = Path(path)
@@ -43,7 +43,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
-    """Refuse a folder whose record, finished or begun, holds other facts than these."""
+    """Refuse a folder whose record, finished or begun, contains other facts than these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
@@ -55,7 +55,9 @@ def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
 
 
 def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
-    """The first setting of ``now`` that ``then`` lacks or has with another value, in words; "" if none."""
+    """Name the first setting of ``now`` that ``then`` lacks or has with another value; return "" if there is
+    none.
+    """
     for name, after in now.items():
         if isinstance(after, dict):
             if deeper := first_difference(then.get(name) or {}, after, f"{path}{name}."):
@@ -67,7 +69,7 @@ def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str 
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
-    """Accept a folder for the result with the record file ``record``: a free or empty one, or its own.
+    """Accept a folder for the result with the record file ``record``: a free or empty folder, or its own.
 
     A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
     with schema ``litho-models/close-loop/1``.
@@ -109,7 +111,7 @@ def _is_record(file: Path) -> bool:
 
 
 def read_record(file: Path) -> Any:
-    """The content of a JSON file; None where there is none."""
+    """Return the content of a JSON file; None if there is no file."""
     try:
         return json.loads(read_text(file))
     except (OSError, ValueError, RecursionError):

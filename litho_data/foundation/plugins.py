@@ -1,4 +1,4 @@
-"""Plug-ins: modules that register a reader, an effect or a model of your own when they are imported.
+"""Plug-ins: modules that register your own reader, effect or model when they are imported.
 
 A plug-in is found by its entry point in the group ``litholoop.plugins``, or named as a file. Every command
 and every worker loads all plug-ins before its work begins.
@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 
 GROUP, OPTION = "litholoop.plugins", "--plugin"
-# Name or file of each loaded plug-in, to its version or the beginning of its hash.
+# Maps the name or file of each loaded plug-in to its version or the beginning of its hash.
 _LOADED: dict[str, str] = {}
 
 
@@ -35,17 +35,17 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
 
 
 def plugin_files() -> list[str]:
-    """The files that were loaded, for other processes."""
+    """Return the files that were loaded, so that other processes can load them."""
     return [name for name in _LOADED if Path(name).is_absolute()]
 
 
 def plugin_versions() -> dict[str, str]:
-    """Each loaded plug-in with its version, or the beginning of its file's hash."""
+    """Return each loaded plug-in with its version, or with the beginning of its file's hash."""
     return {f"plug-in {Path(name).name}": version for name, version in _LOADED.items()}
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words of a command line without ``--plugin FILE``, and the files.
+    """Split a command line into its words without ``--plugin FILE``, and the files.
 
     Raises:
         InputError: the option without a file.
@@ -76,7 +76,9 @@ def _load(name: str, version: str, load: Callable[[], object]) -> None:
 
 
 def _import(path: Path) -> None:
-    """Run a file as the module of its own name, so that other processes can import its classes by it."""
+    """Run a file as the module of its own name, so that other processes can import its classes by this
+    name.
+    """
     known = sys.modules.get(path.stem)
     if known is not None:
         got = f"{path.name}, whose name belongs to {getattr(known, '__file__', None) or 'a part of Python'}"

@@ -11,7 +11,7 @@ from litho_data.foundation.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """Lowest and highest value of a quantity; everything in between is finite."""
+    """The lowest and highest value of a quantity; everything in between is finite."""
 
     low: float
     high: float
@@ -21,7 +21,7 @@ class Range:
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def holds(self, values: object) -> bool:
-        """Whether the value, or every value of an array, is a number within the range."""
+        """Return whether the value, or every value of an array, is a number within the range."""
         if isinstance(values, bool):
             return False
         try:
@@ -31,17 +31,17 @@ class Range:
         return bool(np.all((numbers >= self.low) & (numbers <= self.high)))
 
     def require(self, what: str, values: object) -> None:
-        """Refuse values that are no numbers or out of range.
+        """Refuse values that are not numbers or are out of range.
 
         Raises:
-            InputError: it shows the first such value.
+            InputError: shows the first such value.
         """
         wrong = [one for one in np.ravel(np.asarray(values, dtype=object)) if not self.holds(one)]
         if wrong:
             raise InputError(what, got=repr(wrong[0])[:40], wanted=f"a number from {self}")
 
 
-# From a tenth of a nanometre to one pixel of a centimetre.
+# The range extends from a tenth of a nanometre to one pixel of a centimetre.
 PITCH_UM = Range(1e-4, 1e4, "µm")
 LEVEL_HEIGHT_UM = Range(1e-5, 1e3, "µm")
 HEIGHT_UM = Range(-1e5, 1e5, "µm")

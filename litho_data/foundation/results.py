@@ -1,4 +1,4 @@
-"""Result files: schema-versioned JSON, validated on writing and on reading."""
+"""Result files: JSON with a schema version, validated on writing and on reading."""
 
 import json
 import reprlib
@@ -11,14 +11,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, parsed
 
-# An unexpected value may be of any size and nested to any depth.
+# An unexpected value may have any size and be nested to any depth.
 _SHORT = reprlib.Repr()
 _LONGEST = 40
 _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """A frozen part of a result; an unknown key is an error, but for those in ``FORMER``, of older files."""
+    """A frozen part of a result; an unknown key is an error, except those in ``FORMER``, which older files
+    contain.
+    """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
@@ -59,11 +61,13 @@ class Result(Record):
         return pd.DataFrame(self._facts()).to_html(index=False, header=False)
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What fits on a line: short values, names of parts, and the lengths of longer values."""
+        """Return the facts that fit on a line: short values, names of parts, and the lengths of longer
+        values.
+        """
         facts = []
         for name in type(self).model_fields:
             value = getattr(self, name)
-            # A part that has a name is known by it: a dataset, a model.
+            # A part that has a name (a dataset, a model) is represented by its name.
             value = getattr(value, "name", value)
             if isinstance(value, list | tuple | dict):
                 value = len(value)
@@ -74,7 +78,7 @@ class Result(Record):
     def write(self, folder: str | Path) -> Path:
         """Write ``folder/FILE_NAME`` atomically and return its path."""
         path = Path(folder) / self.FILE_NAME
-        # Validated once more from plain JSON, so that a reader will accept what is written.
+        # The record is validated once more from plain JSON, so that a reader will accept what is written.
         content = self.model_dump(mode="json", by_alias=True)
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
         type(self).model_validate_json(text)
@@ -104,7 +108,7 @@ class Result(Record):
 
 
 def first_error(error: ValidationError) -> str:
-    """The first complaint of pydantic as one line: where, what, and the value."""
+    """Return the first complaint of pydantic as one line: where, what, and the value."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
     if first["type"] == "extra_forbidden":

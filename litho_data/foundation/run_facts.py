@@ -1,4 +1,4 @@
-"""Facts in every result about its run: command, commit, versions, seeds, scans."""
+"""The facts that every result states about its run: command, commit, versions, seeds, scans."""
 
 import platform
 import subprocess
@@ -25,8 +25,8 @@ _COMMAND: ContextVar[str] = ContextVar("command", default="")
 class RunFacts(Record):
     """Command line and code of a result.
 
-    ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed
-    from the commit; None without a checkout, and in older result files.
+    ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
+    commit. It is None without a checkout, and in older result files.
     """
 
     command: str = ""
@@ -36,7 +36,9 @@ class RunFacts(Record):
 
 
 class RunInfo(RunFacts):
-    """Command line, code and scans of a result; ``dropped`` lists scans left out, with the reason."""
+    """Command line, code and scans of a result; ``dropped`` lists the scans that were left out, with the
+    reason.
+    """
 
     seeds: list[int]
     n_scans: int
@@ -44,19 +46,19 @@ class RunInfo(RunFacts):
 
 
 def run_info(seeds: Sequence[int], n_scans: int, dropped: Sequence[str] = ()) -> RunInfo:
-    """The facts of the current run; see :class:`RunInfo`."""
+    """Return the facts of the current run; see :class:`RunInfo`."""
     return RunInfo(**run_facts(), seeds=list(seeds), n_scans=n_scans, dropped=list(dropped))
 
 
 def run_facts() -> dict[str, Any]:
-    """The fields of :class:`RunFacts` for the current run."""
+    """Return the fields of :class:`RunFacts` for the current run."""
     software = software_record()
     return {**software, "command": _COMMAND.get(), "commit": software["commit"] or ""}
 
 
 @contextmanager
 def running_command(command: str) -> Iterator[None]:
-    """Results made inside this context record the command line; library code cannot know it otherwise."""
+    """Record the command line in results made inside this context; library code cannot know it otherwise."""
     token = _COMMAND.set(command)
     try:
         yield
@@ -65,7 +67,9 @@ def running_command(command: str) -> Iterator[None]:
 
 
 def software_record() -> dict[str, Any]:
-    """Which software runs: ``versions`` of packages, BLAS and plug-ins, ``commit`` and ``dirty`` state."""
+    """Return which software runs: ``versions`` of packages, BLAS and plug-ins, and the ``commit`` and
+    ``dirty`` state.
+    """
     software = _software()
     return {**software, "versions": {**software["versions"], **plugin_versions()}}
 
@@ -84,7 +88,8 @@ def _software() -> dict[str, Any]:
 
 
 def checkout_state(folder: Path) -> dict[str, Any]:
-    """``commit`` of a checkout, and whether it is ``dirty``: a file of the packages changed or not in git.
+    """Return the ``commit`` of a checkout, and whether it is ``dirty``: a file of the packages is changed or
+    not in git.
 
     Both are None without a checkout, as for an installed wheel.
     """

@@ -1,4 +1,4 @@
-"""Units of length in files: known ones are converted, all others are refused."""
+"""Convert known units of length in files, and refuse all others."""
 
 import re
 
@@ -23,13 +23,13 @@ _IN_UM = {
     "ångström": 1e-4,
     "pm": 1e-6,
 }
-# MICRO SIGN and GREEK SMALL LETTER MU look the same, Bruker files write a tilde for both, and the
-# ångström has its own sign besides the letter.
+# MICRO SIGN and GREEK SMALL LETTER MU look the same, Bruker files write a tilde for both, and the ångström
+# has a sign of its own in addition to the letter.
 _SPELLINGS = str.maketrans({"\u00b5": "u", "\u03bc": "u", "~": "u", "\u212b": "å", "\u00c5": "å"})
 
 
 def um_per(unit: str) -> float:
-    """How many µm one ``unit`` of length is.
+    """Return how many µm one ``unit`` of length is.
 
     Args:
         unit: for example ``"m"``, ``"nm"``, ``"µm"``, ``"um"``, ``"pm"``, ``"Å"``. Case matters: ``"Mm"`` is
@@ -45,12 +45,12 @@ def um_per(unit: str) -> float:
 
 
 def is_length(unit: str) -> bool:
-    """Whether ``um_per`` knows the unit."""
+    """Return whether ``um_per`` knows the unit."""
     return _short(unit) in _IN_UM
 
 
 def _short(unit: str) -> str:
-    """``nm`` for nanometres, in all spellings."""
+    """Return the short form of a unit in any spelling, such as ``nm`` for nanometres."""
     plain = unit.strip().translate(_SPELLINGS)
     prefix = _METRE.sub("", plain.lower())
     return f"{_PREFIXES[prefix]}m" if _METRE.search(plain.lower()) and prefix in _PREFIXES else plain

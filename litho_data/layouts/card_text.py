@@ -1,4 +1,6 @@
-"""A set of layouts on disk: one TIFF per layout, a table, and a dataset card to which scans can be added."""
+"""Write a set of layouts to disk: one TIFF per layout, a table, and a dataset card to which scans can be
+added.
+"""
 
 import csv
 import json
@@ -26,7 +28,8 @@ def write_card(
     levelled: bool = False,
     **tables: Mapping[str, Any],
 ) -> Path:
-    """Write the card of layouts in ``layouts`` and of their scans, which are or will be in ``scans``.
+    """Write the card of layouts in the folder ``layouts`` and of their scans, which are or will be in
+    ``scans``.
 
     Args:
         folder: where the card goes.
@@ -87,7 +90,7 @@ def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
 
 
 def write_table(folder: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
-    """Write the card's table."""
+    """Write the table of the card."""
     path = folder / TABLE_NAME
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

@@ -1,4 +1,4 @@
-"""Sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
+"""Make sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -25,13 +25,13 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# Leaves an even strip of 1 µm between two edges, as the printer blurs each edge over 1 µm.
+# This width leaves an even strip of 1 µm between two edges, as the printer blurs each edge over 1 µm.
 _TREAD_UM = 3.0
 
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, relative dose, and what its scan is for."""
+    """One layout with its id, relative dose, and the purpose of its scan."""
 
     id: str
     level: Array
@@ -55,7 +55,7 @@ class SetSettings:
 
     @property
     def highest(self) -> int:
-        """The highest level."""
+        """Return the highest level."""
         return self.levels - 1
 
 
@@ -74,9 +74,9 @@ def write_layout_set(
     quantiser: str = "round",
     field_px: int | None = None,
 ) -> Path:
-    """Write a set of layouts into ``out``; returns the path of its card.
+    """Write a set of layouts into ``out``; return the path of its card.
 
-    The folder holds `card.toml`, `scans.csv`, ``layouts/*.tif``, `layouts.json` and a report with the
+    The folder contains `card.toml`, `scans.csv`, ``layouts/*.tif``, `layouts.json` and a report with the
     set's statistics. The card names the folder ``scans/`` in which the measured scans are expected.
 
     Args:
@@ -183,7 +183,7 @@ def _features(settings: SetSettings, feature: int, ground: int) -> Array:
 
 
 def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
-    # Twice the default cut-off: a finer frame determines the scale better.
+    # The cut-off is twice the default: a finer frame determines the scale better.
     frame = random_layout(
         settings.shape,
         levels=settings.levels,

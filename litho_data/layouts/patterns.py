@@ -12,12 +12,14 @@ from litho_data.foundation.kinds import Array, Shape
 
 
 def flat(shape: Shape, *, level: int) -> Array:
-    """One level everywhere: roughness, vignetting, flatness."""
+    """Draw one level everywhere, to measure roughness, vignetting and flatness."""
     return np.full(shape, level, np.uint8)
 
 
 def step_ladder(shape: Shape, *, highest: int) -> Array:
-    """Stairs along x from level 0 to ``highest``, steps of equal width: height against level."""
+    """Draw stairs along x from level 0 to ``highest``, with steps of equal width, to measure height against
+    level.
+    """
     _positive(highest, "highest level of a step ladder")
     steps = highest + 1
     if shape[1] < steps:
@@ -27,11 +29,12 @@ def step_ladder(shape: Shape, *, highest: int) -> Array:
 
 
 def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0) -> Array:
-    """Stairs along x inside a frame that shows their position: height and roughness against level.
+    """Draw stairs along x inside a frame that shows their position, to measure height and roughness against
+    level.
 
-    A ladder alone looks the same wherever it is shifted along its steps, so its scan cannot be registered.
-    The frame, whose width is a fifth of the side, can. The stairs go from ``lowest`` to ``highest`` evenly,
-    over every level if there is room.
+    A ladder alone looks the same wherever it is shifted along its steps, so a scan of it cannot be
+    registered. The frame, whose width is a fifth of the side, makes that possible. The stairs rise evenly
+    from ``lowest`` to ``highest``, over every level if there is room.
 
     Args:
         frame: layout without repeats, (ny, nx).
@@ -53,7 +56,7 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
 
 
 def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Array:
-    """Squares of ``cell_px``, the top left one high: lateral scale, shear, corners."""
+    """Draw squares of ``cell_px``, the top left one high, to measure lateral scale, shear and corners."""
     _positive(cell_px, "cell_px of a checkerboard")
     y, x = np.indices(shape) // cell_px
     return np.where((y + x) % 2 == 0, high, low).astype(np.uint8)
@@ -62,7 +65,7 @@ def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Arra
 def line_space_sweep(
     shape: Shape, *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
 ) -> Array:
-    """Lines and spaces of equal width, each pair one pixel wider: resolution against pitch.
+    """Draw lines and spaces of equal width, each pair one pixel wider, to measure resolution against pitch.
 
     Args:
         narrowest_px: width of the first line.
@@ -80,7 +83,9 @@ def line_space_sweep(
 
 
 def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
-    """``spokes`` wedges around the centre, as wide as the gaps: resolution against direction."""
+    """Draw ``spokes`` wedges around the centre, as wide as the gaps, to measure resolution against
+    direction.
+    """
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
     # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
@@ -90,10 +95,10 @@ def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
-    """Isolated squares of growing width: spot, shrinkage and collapse of single features.
+    """Draw isolated squares of growing width, to measure spot, shrinkage and collapse of single features.
 
-    ``feature`` above ``ground`` makes pillars, below it pits. Each cell of the square array holds one width,
-    in reading order; the space between two features is at least twice the larger width.
+    If ``feature`` is above ``ground`` the squares are pillars, otherwise pits. Each cell of the square array
+    contains one width, in reading order. The space between two features is at least twice the larger width.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)
@@ -113,7 +118,7 @@ def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, g
 
 
 def relative_doses(count: int) -> Array:
-    """Doses of a dose matrix, evenly from 0.7 to 1.3, shape (count,)."""
+    """Return the doses of a dose matrix, evenly spaced from 0.7 to 1.3, shape (count,)."""
     if count < 2:
         raise InputError("dose matrix", got=count, wanted="at least 2 doses")
     return np.linspace(0.7, 1.3, count)

@@ -1,4 +1,6 @@
-"""Random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized … layout"."""
+"""Make random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized …
+layout".
+"""
 
 import numpy as np
 
@@ -20,13 +22,13 @@ def random_layout(
     quantiser: str = "round",
     field_px: int | None = None,
 ) -> Array:
-    """One random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
+    """Make one random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
 
-    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the
-    nearest of ``levels`` values. The result is periodic in both directions. The paper leaves the
-    low-pass filter open: the measured layouts show a sharp square pass band of ±0.25 cycles/µm
-    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were
-    truncated, not rounded: ``quantiser="floor", field_px=540`` makes layouts like them.
+    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the nearest of
+    ``levels`` values. The result is periodic in both directions. The paper does not define the low-pass
+    filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) and ±0.5
+    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated, not
+    rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.
@@ -65,7 +67,7 @@ def random_layout(
         passband=passband,
     )
     lowest, highest = field.min(), field.max()
-    # If only the mean passes, the rounding of the transform still leaves about 1e-17.
+    # If only the mean passes, the rounding of the transform still leaves variations of about 1e-17.
     if highest - lowest < 1e-12:
         raise InputError(
             "cutoff_per_um of a random layout",
@@ -95,6 +97,8 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below; uint8."""
+    """Round values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the integer below;
+    uint8.
+    """
     require_known("quantiser", quantiser, QUANTISERS)
     return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)

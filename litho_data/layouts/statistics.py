@@ -1,4 +1,4 @@
-"""Statistics of a set of layouts."""
+"""Compute the statistics of a set of layouts."""
 
 from __future__ import annotations
 
@@ -88,7 +88,9 @@ def _checked(layout: Array | Path, levels: int) -> Array:
 
 
 def _radial_power(level: Array, pitch_um: float) -> Array:
-    """Power about the mean in radial bins up to the axis Nyquist frequency, normalised per layout."""
+    """Return the power about the mean in radial bins up to the Nyquist frequency of the axes, normalised per
+    layout.
+    """
     window = np.outer(np.hanning(level.shape[0]), np.hanning(level.shape[1]))
     weighted = (level - (level * window).sum() / window.sum()) * window
     spectrum = np.abs(np.fft.fft2(weighted)) ** 2

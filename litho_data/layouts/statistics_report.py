@@ -1,4 +1,4 @@
-"""The human report of a set of layouts."""
+"""Write the report of a set of layouts for people."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEAST_SHARE = 1e-6
 
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
-    """Pictures of the first layouts, level and jump shares, spectrum."""
+    """Make a page with pictures of the first layouts, level and jump shares, and the spectrum."""
     from litho_data.readers import read_layout
 
     page = Page(
@@ -54,7 +54,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
 
 
 def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
-    """Layouts (ny, nx) side by side, by title, their levels on one scale."""
+    """Draw layouts (ny, nx) side by side, by title, with their levels on one scale."""
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):
         axes = figure.add_subplot(1, len(levels), place)

@@ -1,4 +1,4 @@
-"""Features that levelling must not follow: marking them, and alternating between levelling and marking."""
+"""Mark features that levelling must not follow, and alternate between levelling and marking."""
 
 from typing import Annotated, Literal
 
@@ -23,7 +23,7 @@ Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
 Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
-# With a smaller share of the pixels left, the background is a guess.
+# If a smaller share of the pixels is left, the background is a guess.
 _LEAST_BACKGROUND = 0.02
 
 
@@ -39,8 +39,8 @@ def mark_features(
     """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
 
     Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so features must be a
-    minority. Measured pixels that were not selected are marked as well: the
-    result is everything that later steps should exclude.
+    minority. Measured pixels that were not selected are marked as well, so the result is everything that
+    later steps should exclude.
 
     Args:
         z: (ny, nx), any unit, already level.
@@ -69,18 +69,18 @@ def mask_and_relevel(
     side: Side = "both",
     grow_px: Grown = 2,
 ) -> MaskedLevelling:
-    """Level, mark the features, level again without them, until the marks no longer change.
+    """Level, mark the features, and level again without them, until the marks no longer change.
 
-    The first background is robust (Tukey), the following ones are least squares over the unmarked
-    pixels. The background is subtracted with its constant, so that the main surface lies at zero.
-    The returned mask is that of ``mark_features``.
+    The first background is robust (Tukey); the following ones are least-squares fits to the unmarked pixels.
+    The background is subtracted with its constant, so that the main surface lies at zero. The returned mask
+    is that of ``mark_features``.
 
     Raises:
         InputError: parameters outside their range, or features that leave no background.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     surface = robust_surface(z, chosen, terms)
-    # The noise is estimated only once: over the remaining pixels it would shrink in every round.
+    # The noise is estimated only once, because over the remaining pixels it would shrink in every round.
     limit = threshold * noise_sigma((z - surface)[chosen])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):

@@ -1,4 +1,6 @@
-"""Levelling that knows the layout: the printed structure's own slope and bow are not removed."""
+"""Level a scan with knowledge of its layout, so that the printed structure's own slope and bow are not
+removed.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# Below it, background and structure cannot be separated in double precision with noise.
+# Below this value, background and structure cannot be separated in double precision with noise.
 _SINGULAR = 1e-9
 _ROWS_AT_ONCE = 64
 _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
@@ -37,12 +39,12 @@ def level_layout_aware(
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
 ) -> Levelled:
-    """Subtract the background that remains once the layout has explained what it can.
+    """Subtract the background that remains after the layout has explained what it can.
 
-    Least squares of z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
-    response with one knot per level. A plain fit would count the structure's own slope
-    as background. Only the polynomial without its constant is subtracted, with mean zero
-    over the fitted pixels: the datum is part of the response.
+    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
+    response with one knot per level. A plain fit would count the structure's own slope as background. Only
+    the polynomial without its constant is subtracted, with mean zero over the fitted pixels, because the
+    datum is part of the response.
 
     Args:
         z: (ny, nx), any unit.
@@ -76,7 +78,9 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """The known pixels farther than a border from unknown ones; all known pixels if few are left."""
+    """Select the known pixels farther than a border from unknown ones, or all known pixels if few are
+    left.
+    """
     if known.all():
         return known
     inner = ndimage.distance_transform_edt(known) > border_px
@@ -91,7 +95,7 @@ def layout_in_scan_frame(
     layout_pitch_um: float,
     bend_um: Bend | None = None,
 ) -> Array:
-    """The level of the layout pixel under each scan pixel; NaN outside the layout.
+    """Return the level of the layout pixel under each scan pixel; NaN outside the layout.
 
     Args:
         layout_level: (ny, nx) levels.
@@ -114,7 +118,9 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Legendre coefficients of the background for ``evaluate``, and minus the explained sum of squares."""
+    """Return the background's Legendre coefficients for ``evaluate``, and minus the explained sum of
+    squares.
+    """
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]
@@ -134,7 +140,7 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
 
 
 def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, Array]:
-    """Summed over strips of rows, so that the design matrix never exists as a whole."""
+    """Sum the normal equations over strips of rows, so that the design matrix never exists as a whole."""
     x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))
     basis_y = np.polynomial.legendre.legvander(y, max(q for _, q in terms))

@@ -1,4 +1,4 @@
-"""Define an operation of a recipe: a function whose signature states parameters, defaults and limits."""
+"""Define an operation of a recipe as a function whose signature states parameters, defaults and limits."""
 
 import inspect
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
-"""The steps that a recipe can hold, by operation."""
-# Arguments that are no settings, because they come with the scan, and what messages call them.
+"""The steps that a recipe can contain, by operation."""
+# Arguments that are not settings, because they come with the scan, and their names in messages.
 _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
 
 
@@ -33,21 +33,21 @@ class State:
 class Step(BaseModel):
     """Base of all steps: its fields are the arguments of an operation.
 
-    ``masking`` says how the current mask is used: the mask of the scan at first, then that of the
-    latest step that marks something.
+    ``masking`` says how the current mask is used. This is the mask of the scan at first, and then the mask of
+    the latest step that marked something.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # Which arguments come with the scan, and whether they are optional.
+    # Names the arguments that come with the scan, and whether they are optional.
     of_scan: ClassVar[dict[str, bool]]
 
     op: str
     masking: Masking = "exclude"
 
     def run(self, state: State) -> State:
-        """The state with the levelled map, with the marked pixels as its mask, or with both."""
+        """Return the state with the levelled map, with the marked pixels as its mask, or with both."""
         arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
         for name, optional in self.of_scan.items():
             arguments[name] = getattr(state, name)
@@ -63,10 +63,10 @@ class Step(BaseModel):
 def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Register a function of heights and usable pixels as the operation of that name.
 
-    The function gets heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of any
-    type, a ``mask`` and ``masking``; see ``select``. Its keyword arguments are fields of the step, checked at
-    every call, except for those that come with the scan. It returns a ``Levelled``, a ``MaskedLevelling``, or
-    pixels to mark as a bool array.
+    The function receives heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of
+    any type, a ``mask`` and ``masking``; see ``select``. Its keyword arguments become fields of the step,
+    which are checked at every call, except those that come with the scan. The function returns a
+    ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

@@ -1,4 +1,4 @@
-"""Remove tilt and set zero as in Gwyddion: planes by fit, points or prevailing facet."""
+"""Remove tilt and set zero as Gwyddion does: with planes by fit, by points, or by the prevailing facet."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -19,14 +19,14 @@ _FEWEST_CELLS = 4
 def level_plane(z: Array, chosen: Array) -> Levelled:
     """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
 
-    Gwyddion's definition: the fitted constant is replaced by -(bx nx + by ny) / 2, slopes in height per
+    As Gwyddion defines it, the fitted constant is replaced by -(bx nx + by ny) / 2, with slopes in height per
     pixel, so that the mean changes by (bx + by) / 2.
 
     Raises:
         InputError: the selected pixels do not determine a plane. (Gwyddion then removes nothing.)
     """
     coefficients = fit_terms(z, chosen, polynomial_terms(1, 1, 1))
-    # Fitted over coordinates from -1 to 1.
+    # The plane is fitted in coordinates from -1 to 1.
     ny, nx = z.shape
     return _without_tilt(z, 2 * coefficients[0, 1] / (nx - 1), 2 * coefficients[1, 0] / (ny - 1))
 
@@ -40,7 +40,7 @@ def level_three_point(
     radius_px: Annotated[float, Field(ge=0)] = 0.0,
     set_zero: bool = False,
 ) -> Levelled:
-    """Subtract the plane through three points, each the mean over a disc.
+    """Subtract the plane through three points, each of which is the mean over a disc.
 
     Args:
         points_px: three (y, x) positions in pixel indices.
@@ -77,9 +77,9 @@ def _disc_mean(z: Array, chosen: Array, point: YX, radius: float) -> float:
 def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
     """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) stays.
 
-    See ``prevailing_slope`` for the slopes of all 2 x 2 cells whose pixels are selected, s² = mean |v|² / 20,
-    until their change falls below sqrt(1e-9), the limit of Gwyddion 2.62. (That of version 2.45, 1e-8, moves
-    the result by 2e-3 of the range.)
+    ``prevailing_slope`` is applied to the slopes of all 2 x 2 cells whose pixels are selected, with s² = mean
+    |v|² / 20, until the change falls below sqrt(1e-9), the limit of Gwyddion 2.62. (The limit of version
+    2.45, 1e-8, changes the result by 2e-3 of the range.)
 
     Args:
         z: (ny, nx), µm: slopes are physical, so height and pitch must share a unit.
@@ -100,9 +100,9 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
 
 
 def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: float) -> Array:
-    """The slope (d,) of the prevailing facet among slopes v (d, n).
+    """Return the slope (d,) of the prevailing facet among slopes v (d, n).
 
-    Their mean with the weights exp(-|v|² / s²), s² = sharpness · mean |v|², is subtracted, up to ``passes``
+    The mean with the weights exp(-|v|² / s²), s² = sharpness · mean |v|², is subtracted up to ``passes``
     times, until its square is below ``settled2``.
     """
     total = np.zeros(len(slopes))
@@ -121,14 +121,16 @@ def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: 
 
 
 def _without_tilt(z: Array, slope_x: float, slope_y: float, at_pivot: float = 0.0) -> Levelled:
-    """The map minus the plane with these slopes per pixel and this height at column nx/2, row ny/2."""
+    """Subtract the plane with these slopes per pixel and this height at column nx/2, row ny/2."""
     y, x = (np.arange(n) - n / 2 for n in z.shape)
     return subtract(z, np.add.outer(slope_y * y + at_pivot, slope_x * x))
 
 
 @operation("fix-zero")
 def fix_zero(z: Array, chosen: Array) -> Levelled:
-    """Move the lowest selected pixel to zero. This is the height of one pixel, not a physical datum."""
+    """Move the lowest selected pixel to zero. The zero is then the height of one pixel, not a physical
+    datum.
+    """
     return _shift(z, np.min, chosen)
 
 

@@ -1,4 +1,6 @@
-"""Polynomial backgrounds: by least squares, as in Gwyddion, and of the majority of the pixels."""
+"""Remove polynomial backgrounds: by least squares, as in Gwyddion, or fitted to the majority of the
+pixels.
+"""
 
 from functools import lru_cache
 from typing import Annotated
@@ -15,15 +17,15 @@ from litho_data.level.selection import Levelled, subtract
 Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
-# Below it, the smallest direction of the normal matrix is rounding noise.
+# Below this value, the smallest direction of the normal matrix is rounding noise.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
-# Widths in units of the noise at which 95 % of the efficiency of least squares is kept under
-# Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
+# Widths in units of the noise. With these, 95 % of the efficiency of least squares is kept under Gaussian
+# noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
 _HUBER, _TUKEY = 1.345, 4.685
 _MAD_TO_SIGMA = 1.4826
 _MAX_ROUNDS = 200
-# A change of the surface, in units of the noise, that is too small to matter.
+# A change of the surface that is too small to matter, in units of the noise.
 _SETTLED = 1e-7
 
 
@@ -36,11 +38,11 @@ def level_polynomial(
     y_degree: Degree = 3,
     total_degree: Degree | None = None,
 ) -> Levelled:
-    """Subtract the least-squares polynomial, its constant included.
+    """Subtract the least-squares polynomial, including its constant.
 
-    The mean of the fitted pixels becomes zero. Without ``total_degree`` the terms are x^p y^q with
-    p <= x_degree and q <= y_degree (Gwyddion's independent degrees, column and row degree); with
-    it, p + q <= total_degree and the other two degrees do not count (limited total degree).
+    The mean of the fitted pixels becomes zero. Without ``total_degree`` the terms are x^p y^q with p <=
+    x_degree and q <= y_degree (Gwyddion's independent degrees, column and row degree). With it they are those
+    with p + q <= total_degree (limited total degree), and the other two degrees do not count.
 
     Args:
         z: (ny, nx), any unit.
@@ -61,10 +63,10 @@ def level_robust(
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
 ) -> Levelled:
-    """Subtract the robust polynomial with its constant: the main surface then lies at zero.
+    """Subtract the robust polynomial with its constant, which places the main surface at zero.
 
-    Iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
-    weight to distant features and starts from Huber's solution, which has a single minimum.
+    The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
+    weight to distant features. It starts from Huber's solution, which has a single minimum.
 
     Args:
         z: (ny, nx), any unit.
@@ -77,7 +79,7 @@ def level_robust(
 
 
 def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
-    """The robust polynomial on all pixels, fitted to the chosen ones."""
+    """Fit the robust polynomial to the chosen pixels and return it on all pixels."""
     surface = evaluate(fit_terms(z, chosen, terms), z.shape)
     for weights_of in (_huber, _tukey):
         for _ in range(_MAX_ROUNDS):
@@ -93,7 +95,9 @@ def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
 
 
 def noise_sigma(residual: Array) -> float:
-    """1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare outliers."""
+    """Return 1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare
+    outliers.
+    """
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
@@ -106,7 +110,7 @@ def _tukey(scaled: Array) -> Array:
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
-    """The exponents (p, q) of x^p y^q."""
+    """Return the exponents (p, q) of x^p y^q."""
     degrees = (x_degree, y_degree) if total_degree is None else (total_degree, total_degree)
     return tuple(
         (p, q)
@@ -117,11 +121,12 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
 
 
 def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
-    """Weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), P the Legendre polynomials.
+    """Return weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), where P are the Legendre
+    polynomials.
 
-    x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the
-    same polynomials in the Legendre basis as in powers, at a far better condition. The moments
-    are separable, so that the cost is that of a few thin matrix products.
+    x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the same
+    polynomials in the Legendre basis as in powers, but far better conditioned. The moments are separable, so
+    the fit costs only a few thin matrix products.
 
     Args:
         z: (ny, nx); NaN only where the weight is zero.
@@ -144,7 +149,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
         )
     residual = np.where(weights > 0, z, 0.0)
     coefficients = np.zeros((basis_y.shape[1], basis_x.shape[1]))
-    # A second round removes the rounding error of the first under a badly conditioned mask.
+    # Under a badly conditioned mask, a second round removes the rounding error of the first.
     for _ in range(1 if scales[-1] <= _WELL_CONDITIONED * scales[0] else 2):
         right = (basis_y.T @ (weights * residual) @ basis_x)[q, p]
         step = np.zeros_like(coefficients)
@@ -155,7 +160,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
 
 
 def evaluate(coefficients: Array, shape: Shape) -> Array:
-    """The surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
+    """Return the surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
     basis_y, basis_x = (_basis(n, k - 1) for n, k in zip(shape, coefficients.shape, strict=True))
     return basis_y @ coefficients @ basis_x.T
 

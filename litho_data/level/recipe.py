@@ -1,4 +1,4 @@
-"""Levelling recipes: a list of steps, written in TOML or Python and stored with the data."""
+"""Levelling recipes: lists of steps, written in TOML or Python and stored with the data."""
 
 import tomllib
 import warnings
@@ -32,7 +32,8 @@ else:
 class Recipe(BaseModel):
     """Levelling steps in the order in which they are applied; an unknown key is an error.
 
-    In TOML each step is a table ``[[step]]`` with its operation as ``op``, in Python one of ``STEPS``.
+    In TOML each step is a table ``[[step]]`` with its operation as ``op``; in Python it is one of
+    ``STEPS``.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/recipe/1"
@@ -57,7 +58,9 @@ class Recipe(BaseModel):
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:
-        """A recipe from plain tables: those of TOML, or ``canonical()``; raises InputError."""
+        """Make a recipe from plain tables: those of TOML, or ``canonical()``; raise InputError if one is
+        wrong.
+        """
         tables = dict(content)
         if tables.pop("schema", cls.SCHEMA) != cls.SCHEMA:
             raise InputError(f"recipe {source}: schema", got=repr(content["schema"]), wanted=repr(cls.SCHEMA))
@@ -67,7 +70,7 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Everything that determines the result, with all defaults; ``from_dict`` reads it."""
+        """Return everything that determines the result, with all defaults; ``from_dict`` reads it."""
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
     def apply(
@@ -78,7 +81,7 @@ class Recipe(BaseModel):
         mask: Array | None = None,
         layout_level: Array | None = None,
     ) -> Levelled:
-        """Level a scan; ``height + removed`` is the input, both NaN where nothing was measured.
+        """Level a scan. ``height + removed`` is the input, and both are NaN where nothing was measured.
 
         Args:
             scan: a ``Scan``, whose pitch and mask are used, or heights (ny, nx) in µm.
@@ -102,7 +105,9 @@ class Recipe(BaseModel):
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
-        """The result of ``apply``, and the warnings of its steps as texts instead of Python warnings."""
+        """Return the result of ``apply``, with the warnings of its steps as texts instead of Python
+        warnings.
+        """
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)
             levelled = self.apply(scan, **arguments)

@@ -1,4 +1,4 @@
-"""One number per row: trimmed means and the modus of the selected values."""
+"""Compute one number per row: trimmed mean or modus of the selected values."""
 
 import numpy as np
 
@@ -6,20 +6,21 @@ from litho_data.foundation.kinds import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Digits of heights in metres: more than files state, fewer than converting units changes.
+# Number of digits of heights in metres: more than files state, and fewer than unit conversions change.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to here are exact in a double.
 _LARGEST_EXACT_POWER = 22
 
 
 def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
-    """Mean of sorted[t : n - t], t = floor(trim n + 0.5), of each row; where nothing is left, sorted[n // 2].
+    """Return the mean of sorted[t : n - t], t = floor(trim n + 0.5), for each row; if nothing is left,
+    sorted[n // 2].
 
-    For even n that upper median differs from the mean of the two middle values. A row without
-    selected values gives 0.
+    For even n this upper median differs from the mean of the two middle values. A row without selected values
+    gives 0.
     """
     counts = chosen.sum(axis=1)
-    # Unselected values sort behind all others.
+    # Unselected values are sorted behind all others.
     ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
     cut = np.floor(trim * counts + 0.5).astype(int)
     first = np.where(2 * cut >= counts, counts // 2, cut)
@@ -30,11 +31,12 @@ def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
 
 
 def row_modus(values: Array, chosen: Array) -> Array:
-    """Mean of the middle third of the shortest window that holds round(sqrt n) sorted values.
+    """Return the mean of the middle third of the shortest window that contains round(sqrt n) sorted values.
 
-    Below 9 values the upper median; a row without selected values gives 0. Windows of heights with few
-    digits are often equally short. Gwyddion takes the one that comes out shortest in metres, so values (µm)
-    are compared in metres, rounded to 12 digits: no unit of a file changes the choice.
+    Below 9 values the result is the upper median, and for a row without selected values it is 0. Windows of
+    heights with few digits often have equal length. Gwyddion takes the one that is shortest in metres. Values
+    (µm) are therefore compared in metres, rounded to 12 digits, so that the unit of the file does not change
+    the choice.
     """
     return np.array([_modus(np.sort(row[use])) for row, use in zip(values, chosen, strict=True)])
 
@@ -49,7 +51,7 @@ def _modus(ordered: Array) -> float:
 
 
 def _decimal_metres(height_um: Array) -> Array:
-    """The doubles that a file in metres with up to 12 digits would have been read as."""
+    """Return the doubles that would have been read from a file in metres with up to 12 digits."""
     metres = height_um * METRE_PER_UM
     with np.errstate(divide="ignore"):
         exponent = np.nan_to_num(np.floor(np.log10(np.abs(metres))), neginf=0.0)

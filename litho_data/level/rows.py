@@ -1,4 +1,4 @@
-"""Row alignment, with the definitions of Gwyddion's Align Rows."""
+"""Align rows with the definitions of Gwyddion's Align Rows."""
 
 import warnings
 from typing import Annotated, Literal
@@ -29,7 +29,7 @@ _SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
 class LevellingWarning(UserWarning):
-    """A step may have removed part of the print."""
+    """Warns that a step may have removed part of the print."""
 
 
 @operation("align-rows")
@@ -44,7 +44,7 @@ def align_rows(
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Align the rows of a scan; warns if lines were shifted because of the print.
+    """Align the rows of a scan, and warn if lines were shifted because of the print.
 
     Args:
         z: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
@@ -91,10 +91,12 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """A warning if an alignment moved lines although many of their pixels stayed in place; otherwise empty.
+    """Return a warning if an alignment moved lines although many of their pixels stayed in place; otherwise
+    an empty text.
 
-    An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more
-    than the noise, and many of its pixels do not differ from the neighbour, a structure moved the others.
+    An offset of a line moves all of its pixels. The warning names lines that were shifted against their
+    neighbour by far more than the noise although many of their pixels do not differ from it; there, a
+    structure moved the others.
 
     Args:
         z: (ny, nx) before alignment; ``removed``: what was subtracted from it; lines are rows in both.
@@ -112,7 +114,9 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """The statistics of the rows, mean zero; rows with too few pixels take the median of the whole map."""
+    """Return the statistics of the rows with mean zero; rows with too few pixels take the median of the whole
+    map.
+    """
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
     return shifts - shifts.mean()
@@ -122,13 +126,13 @@ def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
     both = chosen[1:] & chosen[:-1]
     steps = np.where(both.sum(axis=1) < _fewest(z), 0.0, row_trimmed_mean(np.diff(z, axis=0), both, trim))
     shifts = np.concatenate([[0.0], np.cumsum(steps)])
-    # Steps alone cannot separate drift from slope, so the linear part stays in the data.
+    # Steps alone cannot separate drift from slope, so the linear part is kept in the data.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
 def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
-    """Weighted mean steps between rows.
+    """Return the weighted mean steps between rows.
 
     Args:
         last_column_counts: use the last column whatever the mask says, as in Gwyddion's include mode.
@@ -148,7 +152,9 @@ def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array
 
 
 def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
-    """The fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds back."""
+    """Return the fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds
+    back.
+    """
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
     fitted = np.zeros(z.shape)
     for i in np.flatnonzero(chosen.sum(axis=1) > degree):
@@ -158,7 +164,9 @@ def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
 
 
 def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
-    """Slope per pixel of the prevailing facet of each row, from neighbours that are both selected."""
+    """Return the slope per pixel of the prevailing facet of each row, from neighbours that are both
+    selected.
+    """
     slopes, both = np.diff(z, axis=1) / pitch_um, chosen[:, 1:] & chosen[:, :-1]
     tilts = np.zeros(len(z))
     for i in np.flatnonzero(both.sum(axis=1) >= _FEWEST_SLOPES):
@@ -168,7 +176,7 @@ def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
 
 
 def _fewest(lines: Array) -> int:
-    """Fewest selected values of a row for its own estimate."""
+    """Return the fewest selected values that a row needs for an estimate of its own."""
     return int(np.log(lines.shape[1]) + 1.5)
 
 

@@ -1,4 +1,6 @@
-"""Levelling one scan: levelled heights and removed surface, in memory or as files with a record."""
+"""Level one scan: return levelled heights and removed surface in memory, or write them as files with a
+record.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,7 @@ _DIMS = ("y", "x")
 
 
 class LevelRecord(RunFacts, Result):
-    """What was levelled, how, and the result; written beside the levelled file as ``<file>.json``."""
+    """What was levelled and how, and the result; stored beside the levelled file as ``<file>.json``."""
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
     FILE_NAME: ClassVar[str] = "level.json"
@@ -41,7 +43,7 @@ def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
     """Level a scan by a recipe, or by the recipe in a TOML file.
 
     Returns:
-        The scan with levelled heights, and the removed surface, (ny, nx) µm; their sum is what came in.
+        The scan with levelled heights, and the removed surface, (ny, nx) µm; their sum is the input.
 
     Raises:
         InputError: a bad recipe, or a step that cannot be applied.
@@ -91,7 +93,7 @@ def write_heights(
     pitch_um: YX | None,
     title: str = "",
 ) -> Path:
-    """Write a height map; the suffix says how.
+    """Write a height map in the format of its suffix.
 
     ``.gsf`` holds float32 metres with size and title, and opens in Gwyddion; ``.npy`` holds
     float64 µm and nothing else. Missing pixels are NaN in both.

@@ -1,4 +1,4 @@
-"""Scars: short strokes along the fast axis where the feedback lost the surface."""
+"""Find and remove scars: short strokes along the fast axis where the feedback lost the surface."""
 
 from functools import wraps
 from typing import Annotated, Any, Literal
@@ -28,13 +28,12 @@ def mark_scars(
     max_width_px: Count = 4,
     sign: ScarSign = "both",
 ) -> Array:
-    """Mark strokes along the rows that stand out from the rows above and below them.
+    """Mark strokes along the rows that stand out from the rows above and below.
 
-    A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel
-    and the higher of the two pixels that bound it above and below (the mirror image for negative
-    ones), in units of rms = sqrt(sum of squared differences between rows / number of pixels).
-    A run along a row counts if it reaches ``high`` somewhere, stays above ``low`` and is at least
-    ``min_length_px`` long.
+    A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel and the
+    higher of the two pixels that bound it above and below; for negative strokes the mirror image applies. The
+    unit is rms = sqrt(sum of squared differences between rows / number of pixels). A run along a row counts
+    if it reaches ``high`` somewhere, stays above ``low`` and is at least ``min_length_px`` long.
 
     Returns:
         bool (ny, nx); only selected pixels are marked.
@@ -59,8 +58,8 @@ def mark_scars(
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
-    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
-    other pixels stay bit for bit, and ``removed`` is zero there.
+    Laplace's equation is solved inside the marks, with the border of the image insulated. All other pixels
+    are unchanged bit for bit, and ``removed`` is zero there.
 
     Raises:
         InputError: marks of another shape, or a marked area without any measured neighbour.
@@ -82,7 +81,7 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
-    """By how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
+    """Return by how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
     for width in range(1, min(max_width_px, ny - 2) + 1):
@@ -107,7 +106,9 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Values of the unknown pixels, as ``z[unknown]``; the solution covers unmeasured pixels as well."""
+    """Return the values of the unknown pixels, as ``z[unknown]``; the solution also covers unmeasured
+    pixels.
+    """
     from SurfaceTopography import Topography
 
     left_out = unknown | ~np.isfinite(z)

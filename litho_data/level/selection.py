@@ -1,4 +1,4 @@
-"""Selection of pixels and result type for all levelling operations."""
+"""Select pixels for levelling operations, and hold their results."""
 
 from typing import Literal, NamedTuple
 
@@ -13,8 +13,8 @@ Masking = Literal["ignore", "exclude", "include"]
 class Levelled(NamedTuple):
     """A levelled map and the surface removed; ``height + removed`` is the input.
 
-    Both are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``;
-    ``removed`` is a number everywhere, and may be a read-only view where it is constant along an axis.
+    Both are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``. ``removed``
+    is a number everywhere, and may be a read-only view if it is constant along an axis.
     """
 
     height: Array
@@ -29,7 +29,7 @@ class MaskedLevelling(NamedTuple):
 
 
 def as_height(height: Array) -> Array:
-    """The map as contiguous float64 (ny, nx).
+    """Return the map as a contiguous float64 array (ny, nx).
 
     Raises:
         InputError: not two-dimensional or below 2 x 2 pixels.
@@ -41,7 +41,7 @@ def as_height(height: Array) -> Array:
 
 
 def select(z: Array, mask: Array | None, masking: Masking) -> Array:
-    """Pixels that an operation may use, bool (ny, nx); never those that were not measured (NaN).
+    """Select the pixels that an operation may use, bool (ny, nx); unmeasured pixels (NaN) are never selected.
 
     Raises:
         InputError: a mask that is not boolean or has another shape, or a selection without any pixel.
@@ -57,5 +57,5 @@ def select(z: Array, mask: Array | None, masking: Masking) -> Array:
 
 
 def subtract(z: Array, removed: Array) -> Levelled:
-    """The map minus the surface."""
+    """Subtract the surface from the map."""
     return Levelled(z - removed, removed)

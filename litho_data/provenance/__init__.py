@@ -1,1 +1,1 @@
-"""Where every array comes from: history, verification, replay."""
+"""Find where every array comes from: history, verification, replay."""

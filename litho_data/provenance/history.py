@@ -1,4 +1,6 @@
-"""Where the arrays of a scan come from: history lists the recorded steps, replay runs them again."""
+"""Find where the arrays of a scan come from: ``history`` lists the recorded steps, ``replay`` runs them
+again.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,14 @@ from litho_data.store.schema import SCAN_VARIABLES, VARIABLES
 
 _HASH_DIGITS = 12
 Recorded = dict[str, list[tuple[str, Step]]]
-"""Steps of every scan in order, each with its recorded id."""
+"""The steps of every scan in order, each with its recorded id."""
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
-    """The chain of one scan as text, from the raw files to the arrays, with all parameters and hashes.
+    """Return the chain of one scan as text, from the raw files to the arrays, with all parameters and hashes.
 
-    Without a scan: one line per scan, from its raw files through the operations to its registered height.
+    Without a scan, the text has one line per scan, from its raw files through the operations to its
+    registered height.
 
     Raises:
         InputError: no such store or scan.
@@ -67,7 +70,7 @@ def _overview(recorded: Recorded) -> Iterator[str]:
 
 
 def read_steps(store: Store) -> Recorded:
-    """Recorded steps of every scan in order, each with its recorded id.
+    """Return the recorded steps of every scan in order, each with its recorded id.
 
     Raises:
         InputError: a store without provenance, or a record that is no JSON.
@@ -84,13 +87,13 @@ def read_steps(store: Store) -> Recorded:
 
 
 def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
-    """The recorded steps of one scan; InputError if there is no such scan."""
+    """Return the recorded steps of one scan, or raise InputError if there is no such scan."""
     require_known("scan", scan_id, recorded)
     return recorded[scan_id]
 
 
 def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
-    """Folder of the raw files of a store; None if they cannot be found.
+    """Find the folder of the raw files of a store; return None if they cannot be found.
 
     Raises:
         InputError: ``data_dir`` is given but is no folder.
@@ -106,16 +109,16 @@ def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
 
 
 def require_folder(data_dir: str | Path) -> Path:
-    """The folder that the user named; InputError if there is none."""
+    """Return the folder that the user named, or raise InputError if it does not exist."""
     if not Path(data_dir).is_dir():
         raise InputError("folder of raw files", got=str(data_dir), wanted="an existing folder")
     return Path(data_dir)
 
 
 def stored_array(store: Store, scan_id: str, name: str) -> Array | None:
-    """A scan's array by name, from the arrays over all scans or from its own group.
+    """Read a scan's array by name, from the arrays over all scans or from the scan's own group.
 
-    None for the layout of a reference scan, which is not kept.
+    Return None for the layout of a reference scan, which is not stored.
 
     Raises:
         InputError: no such array, or a stored chunk that does not decode.
@@ -183,7 +186,7 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
-    """Arrays in the order in which they are made, each from the outputs of earlier steps."""
+    """Yield arrays in the order in which they are made, each computed from the outputs of earlier steps."""
     made: dict[str, Array] = {}
     for step in steps:
         if step.op not in OPERATIONS:

@@ -1,4 +1,4 @@
-"""``verify``: is a store unchanged since its build, and are its raw files unchanged?"""
+"""Verify that a store is unchanged since its build, and that its raw files are unchanged."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that has changed since the build: the place and what is wrong with it."""
+    """Something that has changed since the build: where it is, and what is wrong with it."""
 
     where: str
     problem: str
@@ -36,7 +36,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of ``verify``. ``notes`` report no damage."""
+    """The result of ``verify``. ``notes`` do not report damage."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -46,7 +46,7 @@ class Verification:
 
 
 def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verification:
-    """Hash everything again and compare it with what was recorded at the build.
+    """Hash everything again and compare it with what the build recorded.
 
     Args:
         store_path: a ``.zarr`` folder or ``.zarr.zip`` file.
@@ -58,12 +58,12 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
     """
     path = Path(store_path)
     if open_root(path).attrs.get("schema") != STORE_SCHEMA:
-        raise InputError(f"{path} carries no provenance", wanted="a store made by litho-data build")
+        raise InputError(f"{path} has no provenance", wanted="a store made by litho-data build")
     if data_dir is not None:
         require_folder(data_dir)
     findings = [*_guarded(_documents(path)), *_guarded(_missing(path))]
     try:
-        # Not `open_store`, which refuses a store with findings.
+        # `open_store` is not used here, because it refuses a store with findings.
         store = Store(open_root(path), path)
         history = read_steps(store)
         manifest = store.manifest
@@ -96,7 +96,7 @@ def _missing(path: Path) -> Iterator[Finding]:
 
 
 def _documents(path: Path) -> Iterator[Finding]:
-    """Metadata documents that are damaged or differ from their copy in the root document."""
+    """Yield the metadata documents that are damaged or differ from their copy in the root document."""
     documents: dict[str, Any] = {}
     for name, content in read_documents(path, file_names(path)):
         try:
@@ -174,7 +174,7 @@ def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
 
 
 def _arrays(store: Store, history: Recorded) -> Iterator[Finding | None]:
-    """One entry per stored array of every scan: None if it still has its hash."""
+    """Yield one entry per stored array of every scan: None if the array still has its hash."""
     for scan_id, steps in history.items():
         for name, wanted in ((one["name"], one["sha256"]) for _, step in steps for one in step.outputs):
             yield _array(store, scan_id, name, wanted)

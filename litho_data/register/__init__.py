@@ -1,4 +1,4 @@
-"""Registration of AFM scans onto the layouts they were printed from."""
+"""Register AFM scans onto the layouts from which they were printed."""
 
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform

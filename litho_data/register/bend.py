@@ -1,4 +1,4 @@
-"""The bend of a scan: the smooth difference between the true and the stated position of the scanner."""
+"""The bend of a scan: the smooth difference between the true and the stated positions of the scanner."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from litho_data.foundation.kinds import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# As a share of the half width of the scan: far below a thousandth of a pixel.
+# Tolerance as a share of the half width of the scan: far below a thousandth of a pixel.
 _SETTLED = 1e-9
 # A bend with a slope of 0.1 is undone in 10 steps, one with a slope of 0.9 in 200.
 _STEPS = 400
-# Points along each side of the frame where the size of a bend is taken.
+# Number of points along each side of the frame at which the size of a bend is evaluated.
 _GRID = 65
 
 
 @dataclass(frozen=True)
 class Bend:
-    """Displacement of the points of a scan, a polynomial of u and v, which run from -1 to 1 over the frame.
+    """Displacement of the points of a scan: a polynomial of u and v, which run from -1 to 1 over the frame.
 
-    ``amount`` is (2, 3): along x and y, for u² - 1/3, uv and v² - 1/3; or (2, 11) for a scanner that creeps,
-    followed by the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v). These terms are centred: the best
-    affine part of a bend over the frame is zero. ``middle`` and ``half`` are the frame's centre and half its
-    size (x, y), in the unit of ``amount``; u = (x - middle) / half.
+    ``amount`` is (2, 3), along x and y, for u² - 1/3, uv and v² - 1/3. For a scanner that creeps it is (2,
+    11), with the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v) after these. These terms are centred, so
+    the best affine part of a bend over the frame is zero. ``middle`` and ``half`` are the centre and half the
+    size (x, y) of the frame, in the unit of ``amount``; u = (x - middle) / half.
     """
 
     amount: Array
@@ -34,13 +34,15 @@ class Bend:
 
     @classmethod
     def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
-        """The bend of a scan with (ny, nx) pixels and this (y, x) pitch, in µm of its own frame."""
+        """Make the bend of a scan with (ny, nx) pixels and this (y, x) pitch, in µm of the scan's own
+        frame.
+        """
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
         return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
     @property
     def figures(self) -> dict[str, float]:
-        """The bend for the quality record: its largest displacement and its six coefficients, µm.
+        """Describe the bend for the quality record: its largest displacement and its six coefficients, µm.
 
         ``bend_x_by_xx_um`` is the displacement along x per u² - 1/3, and so on.
         """
@@ -50,23 +52,23 @@ class Bend:
 
     @classmethod
     def none_yet(cls, shape: Shape) -> Bend:
-        """A straight scan of this (ny, nx) shape, in its index frame."""
+        """Make the bend of a straight scan of this (ny, nx) shape, in the scan's index frame."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
     def in_pixels(self, pitch_um: YX) -> Bend:
-        """A bend in µm as one in the index frame of a scan of this (y, x) pitch."""
+        """Convert a bend in µm to the index frame of a scan with this (y, x) pitch."""
         pitch_x_y = np.array(pitch_um[::-1])
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
 
     def scaled(self, factor: float) -> Bend:
-        """The same bend in a unit ``1 / factor`` times as long."""
+        """Express the same bend in a unit ``1 / factor`` times as long."""
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Distance (along x, along y) of points of the scan from their nominal position.
+        """Return the distance (along x, along y) of points of the scan from their nominal positions.
 
-        Outside the frame it is that of the nearest point of the frame.
+        Points outside the frame have the distance of the nearest point of the frame.
         """
         u, v = (np.clip(one, -1, 1) for one in self.unit(x, y))
         terms = _terms(u, v, self.degree)
@@ -74,11 +76,13 @@ class Bend:
         return along_x, along_y
 
     def straighten(self, points: Array) -> Array:
-        """True positions of points (n, 2) of the scan."""
+        """Return the true positions of points (n, 2) of the scan."""
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """The points of the scan with true position (x, y); exact if ``slope`` is below 1."""
+        """Return the points of the scan whose true position is (x, y); the result is exact if ``slope`` is
+        below 1.
+        """
         at_x, at_y = x, y
         for _ in range(_STEPS):
             shift_x, shift_y = self.shift(at_x, at_y)
@@ -90,34 +94,34 @@ class Bend:
 
     @property
     def largest(self) -> float:
-        """The longest displacement in the frame."""
+        """Return the longest displacement in the frame."""
         return float(np.hypot(*self._field()).max())
 
     @property
     def slope(self) -> float:
-        """The largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
-        # Exact for a bend, and to a thousandth for creep.
+        """Return the largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
+        # The grid is exact for a bend, and exact to a thousandth for creep.
         spacing = 2 * self.half[::-1] / (_GRID - 1)
         gradient = np.array([np.gradient(one, *spacing, edge_order=2) for one in self._field()])
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
     def _field(self) -> tuple[Array, Array]:
-        """Displacements on an even grid over the frame."""
+        """Return displacements on an even grid over the frame."""
         unit = np.linspace(-1, 1, _GRID)
         return self.shift(*np.meshgrid(*(self.middle[:, None] + self.half[:, None] * unit)))
 
     @property
     def kind(self) -> str:
-        """``quadratic`` or ``creep``."""
+        """Return ``quadratic`` or ``creep``."""
         return "quadratic" if self.degree == 2 else "creep"
 
     @property
     def degree(self) -> int:
-        """Degree of the polynomial: 2, or 6 for creep."""
+        """Return the degree of the polynomial: 2, or 6 for creep."""
         return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
 
     def unit(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """(u, v) of points."""
+        """Return the coordinates (u, v) of points."""
         return (x - self.middle[0]) / self.half[0], (y - self.middle[1]) / self.half[1]
 
 
@@ -132,10 +136,10 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """The affine (3×3) and the bend that take points (n, 2) to their images, by least squares.
+    """Fit by least squares the affine (3×3) and the bend that map points (n, 2) to their images.
 
-    ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame,
-    ``degree`` is 2, or 6 for creep.
+    ``images`` ≈ affine(``points`` + bend(``points``)), where ``middle`` and ``half`` belong to the bend's
+    frame, and ``degree`` is 2, or 6 for creep.
 
     Raises:
         numpy.linalg.LinAlgError: points that do not determine six coefficients per axis (too few, or all on

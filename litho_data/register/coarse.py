@@ -1,4 +1,4 @@
-"""The coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
+"""Find the coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ from litho_data.register.geometry import (
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
 
 CLEAR_MARGIN = 0.1
-# Correlation above which a hypothesis is accepted without support from features.
+# Above this correlation a hypothesis is accepted without support from features.
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
@@ -27,7 +27,7 @@ SEARCH_BLUR_PX = 2.0
 
 @dataclass(frozen=True)
 class CoarseFit:
-    """Position of the scan, to a few pixels.
+    """The position of the scan to within a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
     ``points`` is None if too few keypoints match; the fit is then the best correlation over all shifts.
@@ -40,7 +40,7 @@ class CoarseFit:
 
     @property
     def method(self) -> str:
-        """What found it: ``orb`` or ``correlation``."""
+        """Return the method that found the fit: ``orb`` or ``correlation``."""
         return "orb" if self.points else "correlation"
 
 
@@ -52,7 +52,7 @@ def find_coarse(
     features: bool,
     seed: int,
 ) -> CoarseFit | None:
-    """The best coarse fit, or None if scan or layout shows no structure.
+    """Find the best coarse fit; return None if scan or layout shows no structure.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, bow removed, NaN where not measured.
@@ -73,7 +73,9 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """The best hypothesis, or the upright one if a symmetric layout makes it equally good."""
+    """Return the best hypothesis, or the upright one if the layout is symmetric and fits equally well
+    upright.
+    """
     best = hypotheses[0]
     for hypothesis in hypotheses:
         upright = (hypothesis.orientation, hypothesis.polarity) == ("identity", 1)
@@ -83,10 +85,10 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 
 
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
-    """Orientations and polarities in which to look for keypoints.
+    """Return the orientations and polarities in which to look for keypoints.
 
-    ORB does not depend on rotation, so only the four combinations of mirror image and polarity differ; all
-    are tried if the correlation leaves the orientation open.
+    ORB does not depend on rotation, so only the four combinations of mirror image and polarity differ. All
+    are tried if the correlation does not determine the orientation.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
@@ -102,7 +104,7 @@ def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str,
 def _fit_features(
     scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
-    """A fit from matched keypoints, or None if its inliers are too few or too clustered."""
+    """Fit matched keypoints; return None if the inliers are too few or too clustered."""
     points = match_features(polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:
         return None

@@ -2,7 +2,7 @@
 
 A bend displaces the image by a quadratic function of position. A scanner that is still settling displaces its
 lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the linear part of
-the creep; the rest distorts the print by a tenth of the creep and shows nowhere else.
+the creep. The rest distorts the print by a tenth of the creep and leaves no other trace.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
 
 Curve = int | Literal["quadratic"] | None
-"""What is fitted beside an affine: the slow axis (0 = x, 1 = y) of a creep, a bend, or nothing."""
-# Every second pixel of the layout in both directions locates the print as well as all pixels.
+"""What is fitted in addition to an affine: creep along the slow axis (0 = x, 1 = y), a bend, or nothing."""
+# Every second pixel of the layout in both directions locates the print as well as all pixels do.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
@@ -32,11 +32,12 @@ _BACKGROUND = 6
 
 
 def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Curve) -> FineFit | None:
-    """The straight warp refined again as an affine and a curve; None if the fit does not converge.
+    """Refine the straight warp as an affine and a curve; return None if the fit does not converge.
 
-    Creep displaces along x and y by a polynomial of degree 6 in the slow coordinate, ten numbers besides the
-    affine. It also has to do better on blocks held out of the fit: it and the straight warp are fitted to
-    each half of the field, squares of 64 px in a chequerboard, and each fit predicts the other half.
+    Creep displaces along x and y by a polynomial of degree 6 in the slow coordinate: ten numbers in addition
+    to the affine. The curve must also do better on blocks held out of the fit. Curve and straight warp are
+    fitted to each half of the field (squares of 64 px in a chequerboard), and each fit predicts the other
+    half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
@@ -65,7 +66,7 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
 def _from_coarse_to_fine(
     scan: Array, layout_level: Array, found: tuple[Array, Bend], curve: Curve
 ) -> tuple[Array, Bend]:
-    """Warp and bend, refined at a quarter and at half resolution."""
+    """Refine warp and bend at a quarter and at half resolution."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         small = _Images(small_scan, small_topography)
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
@@ -77,10 +78,10 @@ def _from_coarse_to_fine(
 
 
 def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
-    """The scan minus the quadratic surface that the topography does not explain.
+    """Subtract from the scan the quadratic surface that the topography does not explain.
 
-    A surface that is quadratic in the scan's frame, including the print's share of it, is not quadratic in
-    the layout's frame once the scan is straightened. It would distort the bend.
+    A surface that is quadratic in the scan's frame, including the print's share of it, is no longer quadratic
+    in the layout's frame after the scan is straightened. There it would distort the bend.
     """
     from scipy.ndimage import map_coordinates
 
@@ -113,16 +114,16 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # A rank test, because creep fades along the scan, so that a few blocks gain most.
+    # A rank test is used, because creep fades along the scan, so that a few blocks gain most.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
 
 class _Images:
-    """A scan and the topography that it is compared with, for fitting warps to any choice of pixels."""
+    """A scan and the topography with which it is compared, for fitting warps to any choice of pixels."""
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """``every``: use every n-th row and column of the topography; indices count these."""
+        """``every``: use every n-th row and column of the topography; indices refer to these."""
         from scipy.ndimage import spline_filter
 
         self._measured = np.isfinite(scan)
@@ -135,7 +136,7 @@ class _Images:
         self.everywhere = interior_of(shape, BORDER_PX // every)
 
     def fit(self, matrix: Array, bend: Bend, curve: Curve, chosen: Array) -> tuple[Array, Bend] | None:
-        """Affine and curve by Gauss-Newton steps; None if they do not converge."""
+        """Fit affine and curve by Gauss-Newton steps; return None if they do not converge."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
         points = lattice(y, x)
         for _ in range(_ITERATIONS):
@@ -163,7 +164,9 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Squared misfit of every pixel, gain and background fitted to ``fitted``; NaN outside the scan."""
+        """Return the squared misfit of every pixel after gain and background are fitted to ``fitted``; NaN
+        outside the scan.
+        """
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)
         chosen = inside & fitted
@@ -181,7 +184,7 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """The terms that can move a point of the scan along one axis: 1, u, v, and those of the curve."""
+    """Return the terms that can move a point of the scan along one axis: 1, u, v, and those of the curve."""
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]
     if curve == "quadratic":

@@ -1,7 +1,7 @@
 """Find areas where a scan does not show the print: dust, collapsed or missing parts, lifted film.
 
-Such an area shifts a least-squares warp by pixels. Over a connected area its heights differ from the
-prediction of the layout by many times the usual misfit, for any response of the printer.
+Such an area can shift a least-squares warp by whole pixels. Over this connected area the heights differ from
+the prediction of the layout by many times the usual misfit, for any response of the printer.
 """
 
 from dataclasses import replace
@@ -15,27 +15,28 @@ from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-# Misfit in units of its robust standard deviation. An area that reaches the first is suspected and traced
-# down to the second; it is a defect if it reaches the third after a fit of the warp without it. Effects of a
-# printer other than a Gaussian blur stay below: 13.5 on the measured prints.
+# Misfits in units of their robust standard deviation. An area whose misfit reaches the first value is
+# suspected and traced down to the second. It is a defect if its misfit reaches the third after the warp is
+# fitted without it. Effects of a printer other than a Gaussian blur stay below the third value: 13.5 on the
+# measured prints.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# Beyond this share no main surface is left, and the whole print is in question.
+# Beyond this share no main surface is left, and the whole print is doubtful.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
 _FEWEST_PX = 60
-# As a share of the standard deviation of the scan.
+# Smallest sigma, as a share of the standard deviation of the scan.
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
 # Pixels that enter and leave at the edge of a mask keep the steps above a thousandth of a pixel.
 _TOLERANCE_PX = 0.01
-# From this share of the field on, a suspected area may have spoiled the fit so that its own misfit looks
+# A suspected area of at least this share of the field may have spoiled the fit, so that its own misfit looks
 # small.
 _WORTH_A_FIT = 0.005
-# Correlation below which a whole print may misfit; the measured prints have 0.945 and more.
+# Below this correlation a whole print may misfit; the measured prints have 0.945 and more.
 _SUSPICIOUS = 0.9
 _MAD_PER_SIGMA = 0.6745
 _TUKEY = 4.685
@@ -45,9 +46,10 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """The fit without the defects, and the defects, bool (ny, nx) of the layout; or the plain fit.
+    """Return the fit without the defects, and the defects, bool (ny, nx) of the layout; or the plain fit if
+    there are none.
 
-    Every round starts from the coarse warp, which is robust: it finds the defects under the last warp and
+    Every round starts from the coarse warp, which is robust. It finds the defects under the last warp and
     fits the warp to the rest, until the corners of the warp no longer move.
 
     Args:
@@ -58,7 +60,7 @@ def refine_around_defects(
     for attempt in range(_ROUNDS):
         found, largest_sigma = find_defects(plain.scan, fine)
         if not found.any() and attempt == 0 and plain.refinement.correlation < _SUSPICIOUS:
-            # A large defect may have pulled the plain fit so far that all of the print misfits.
+            # A large defect may have pulled the plain fit so far that the whole print misfits.
             fine = replace(plain, refinement=replace(plain.refinement, layout_to_scan=start))
             found, largest_sigma = find_defects(plain.scan, fine)
         if not found.any() or (largest_sigma < DEFECT_SIGMA and found.mean() < _WORTH_A_FIT):
@@ -77,9 +79,10 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Pixels of the layout that show something other than the print, with a margin, and their largest misfit.
+    """Find the pixels of the layout where the scan shows something else, with a margin; also return the
+    largest misfit.
 
-    The misfit is the scan on the layout's pixels minus a free function of the predicted topography
+    The misfit is the scan on the layout's pixels, minus a free function of the predicted topography
     (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
     connected area of 30 pixels or more with a misfit of 3 sigma that reaches 8 sigma somewhere.
 
@@ -96,8 +99,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     misfit = _misfit(scan, fine)
     if misfit is None:
         return nowhere
-    # Without noise the whole misfit may come from edges, so a misfit that is small beside the print is no
-    # defect.
+    # Without noise the whole misfit may come from edges, so a misfit that is small compared with the print is
+    # not a defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
     if size.max() <= SUSPECT_SIGMA:
@@ -115,7 +118,7 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
 
 
 def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array:
-    """A copy of the scan (ny, nx) with NaN where it shows a defect of the layout's pixels."""
+    """Copy the scan (ny, nx), with NaN where it shows a defect of the layout's pixels."""
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
     inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
@@ -123,9 +126,10 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Scan minus the part that the layout explains, (ny, nx), NaN at the border and where not measured.
+    """Return the scan minus the part that the layout explains, (ny, nx); NaN at the border and where not
+    measured.
 
-    None if the scan shows next to nothing of the layout.
+    Return None if the scan shows almost nothing of the layout.
     """
     from scipy.ndimage import map_coordinates
 
@@ -150,7 +154,7 @@ def _misfit(scan: Array, fine: FineFit) -> Array | None:
 
 
 def _robust(design: Array, values: Array) -> Array:
-    """Coefficients with Tukey's weights, starting from a fit with weights that fall off slowly."""
+    """Fit coefficients with Tukey's weights, starting from a fit with weights that fall off slowly."""
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])
     for step in range(_PASSES):

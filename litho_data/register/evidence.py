@@ -1,4 +1,4 @@
-"""The uncertainty of a registration: held-out blocks, bootstrap, correlation."""
+"""Estimate the uncertainty of a registration by held-out blocks, bootstrap and correlation."""
 
 from dataclasses import dataclass
 
@@ -19,10 +19,10 @@ SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """Fit of single blocks of the field to the warp; arrays (n, 2) of (x, y) in layout pixels.
+    """How single blocks of the field fit the warp; arrays (n, 2) of (x, y) in layout pixels.
 
-    ``shift_px`` is the displacement of a block's content from its position by the warp, ``held_out_px`` the
-    same for a warp fitted without the block.
+    ``shift_px`` is the displacement of a block's content from its position by the warp. ``held_out_px`` is
+    the same for a warp fitted without the block.
     """
 
     middle_px: Array
@@ -30,12 +30,13 @@ class BlockShifts:
     held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
-        """Percentiles of the target registration error, NaN without blocks."""
+        """Return the percentiles of the target registration error; NaN without blocks."""
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Peak to valley of the mean shift along ``axis`` (0 = x, 1 = y) as a function of ``along``.
+        """Return the peak-to-valley range of the mean shift along ``axis`` (0 = x, 1 = y) as a function of
+        ``along``.
 
         A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
         not linear or that the scanner creeps, which no rung of the ladder can follow.
@@ -44,7 +45,9 @@ class BlockShifts:
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Whether the curve along this axis is large and exceeds the scatter of blocks at the same place."""
+        """Return whether the curve along this axis is large, and larger than the scatter of blocks at the
+        same place.
+        """
         for axis in (0, 1):
             groups = self._by_place(axis, along)
             if len(groups) < 3 or min(len(group) for group in groups) < 3:
@@ -64,7 +67,8 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """The shift of every block, under the warp and under a warp refitted to the pixels outside the block.
+    """Return the shift of every block, under the warp and under a warp refitted to the pixels outside the
+    block.
 
     Args:
         registered: (ny, nx) smoothed scan on the layout's pixels, background removed, gaps filled.
@@ -108,7 +112,7 @@ def match_blocks_of_field(
 
 
 def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> float:
-    """Largest standard deviation of a corner over bootstrap draws of the field's blocks, px."""
+    """Return the largest standard deviation of a corner over bootstrap draws of the field's blocks, px."""
     blocks = refinement.blocks()
     blocks = blocks.reshape(-1, *blocks.shape[2:])
     if len(blocks) < 4:
@@ -121,7 +125,7 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 
 
 def height_correlation(height: Array, layout_level: Array) -> float:
-    """Pearson correlation of heights, smoothed with sigma = 1 px, with the unblurred layout.
+    """Return the Pearson correlation of heights, smoothed with sigma = 1 px, with the unblurred layout.
 
     Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
     """
@@ -132,7 +136,7 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Sub-pixel position (x, y) of the maximum; a maximum on the border stays where it is."""
+    """Return the sub-pixel position (x, y) of the maximum; a maximum on the border is returned as it is."""
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)
     for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):

@@ -1,4 +1,4 @@
-"""Coarse registration without an assumption about position: matched points and a robust affine."""
+"""Register coarsely without assuming a position: match points and fit a robust affine."""
 
 from dataclasses import dataclass
 
@@ -21,9 +21,9 @@ _FEWEST_MATCHES = 6
 class Correspondence:
     """Matched points and the affine that most of them agree on.
 
-    ``layout_points`` and ``scan_points`` are (n, 2) index coordinates (x, y) of the matches, ``inlier``
-    tells which agree with ``layout_to_scan`` within ``INLIER_PX``; ``hull_px2`` is the area of the layout
-    inside the convex hull of the inliers; ``keypoints`` is the smaller count of the two images.
+    ``layout_points`` and ``scan_points`` are (n, 2) index coordinates (x, y) of the matches. ``inlier`` says
+    which of them agree with ``layout_to_scan`` within ``INLIER_PX``. ``hull_px2`` is the area of the layout
+    inside the convex hull of the inliers, and ``keypoints`` the smaller count of the two images.
     """
 
     keypoints: int
@@ -34,11 +34,13 @@ class Correspondence:
     hull_px2: float
 
     def coverage(self, overlap: Array) -> float:
-        """Area spanned by the inliers, as a share of the overlap of scan and layout."""
+        """Return the area spanned by the inliers, as a share of the overlap of scan and layout."""
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
     def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
-        """Root mean square distance of the inliers from a warp, in pixels of the (straightened) scan."""
+        """Return the root mean square distance of the inliers from a warp, in pixels of the (straightened)
+        scan.
+        """
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
         found = self.scan_points[self.inlier]
         found = found if bend is None else bend.straighten(found)
@@ -46,7 +48,7 @@ class Correspondence:
 
 
 def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
-    """Keypoints of both images by ORB, cross-checked matches and a MAGSAC affine.
+    """Find keypoints of both images by ORB, match them with a cross-check, and fit an affine by MAGSAC.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
@@ -90,7 +92,9 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
 
 
 def _contrast_image(image: Array) -> Array:
-    """8-bit copy with local contrast equalised; used to find keypoints, never for heights."""
+    """Return an 8-bit copy with equalised local contrast, which is used to find keypoints, never for
+    heights.
+    """
     import cv2
 
     low, high = np.percentile(image, (0.5, 99.5))

@@ -1,4 +1,4 @@
-"""The figures of one registration, from the fit and the images it compared."""
+"""Compute the figures of one registration from the fit and the images that it compared."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from litho_data.register.topography import quadratic_basis
 
 
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    """Figures of the fit: how the warp was found, and how well it explains matches and heights."""
+    """Return figures of the fit: how the warp was found, and how well it explains matches and heights."""
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     figures: dict[str, Any] = {
         "model": fine.refinement.model if bend is None else bend.kind,
@@ -38,7 +38,7 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
-    """Place, scale and rotation at the layout's middle; for a bent scan, those of the closest affine.
+    """Return place, scale and rotation at the layout's middle; a bent scan has those of the closest affine.
 
     The place is the position of the middle in the scan minus its position in the layout.
     """
@@ -57,8 +57,8 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
-    """Figures of the warp's uncertainty, from held-out blocks, bootstrap and other candidates; also the
-    blocks.
+    """Return figures of the warp's uncertainty, from held-out blocks, bootstrap and other candidates; also
+    return the blocks.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))

@@ -8,7 +8,7 @@ import numpy as np
 from litho_data.foundation.kinds import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# Each rung uses the first so many generators, so the ladder is nested by construction.
+# Each rung uses the first generators of the list, this many of them, so the ladder is nested.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0
@@ -22,14 +22,16 @@ BENT_COUNT = 12
 
 
 def normalisation(shape: Shape) -> Array:
-    """Matrix from index coordinates to ones of order one about the middle, same scale for both axes."""
+    """Return the matrix that maps indices to coordinates of order one about the middle, with the same scale
+    on both axes.
+    """
     scale = 2.0 / (max(shape) - 1)
     ny, nx = shape
     return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
 
 
 def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """Velocity (along x, along y) of normalised points under a generator; x and y broadcast."""
+    """Return the velocity (along x, along y) of normalised points under a generator; x and y broadcast."""
     coordinates = (x, y, np.ones(1, dtype=x.dtype))
     zero = np.zeros(1, dtype=x.dtype)
     moved_x, moved_y, weight = (
@@ -39,7 +41,9 @@ def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
-    """Velocities of the first ``count`` generators; for ``BENT_COUNT`` all affine and quadratic ones."""
+    """Yield the velocities of the first ``count`` generators; for ``BENT_COUNT``, of all affine and quadratic
+    ones.
+    """
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)
     if count == BENT_COUNT:

@@ -1,4 +1,4 @@
-"""Frames, units and orientations: relations of pixel indices, micrometres and rotated images.
+"""Frames, units and orientations: how pixel indices, micrometres and rotated images correspond.
 
 Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. An *index* frame counts
 pixel centres 0, 1, 2 …; the micrometre frame of the same image has those centres at
@@ -11,7 +11,8 @@ from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
-# name: (transpose, then flip rows, then flip columns); the operation that brings the scan onto the layout.
+# Each name stands for: transpose, then flip rows, then flip columns; this operation turns the scan onto the
+# layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -25,13 +26,13 @@ ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
 
 
 def index_to_um(pitch_um: YX) -> Array:
-    """The matrix from pixel indices (x, y) to µm for a (y, x) pitch."""
+    """Return the matrix that maps pixel indices (x, y) to µm for a (y, x) pitch."""
     pitch_y, pitch_x = pitch_um
     return np.array([[pitch_x, 0.0, pitch_x / 2], [0.0, pitch_y, pitch_y / 2], [0.0, 0.0, 1.0]])
 
 
 def orient(image: Array, orientation: str) -> Array:
-    """The image after one of the eight operations of ``ORIENTATIONS`` (a view)."""
+    """Return the image after one of the eight operations of ``ORIENTATIONS`` (a view)."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     turned = image.T if transpose else image
     turned = turned[::-1] if flip_y else turned
@@ -39,7 +40,9 @@ def orient(image: Array, orientation: str) -> Array:
 
 
 def orientation_matrix(orientation: str, shape: Shape) -> Array:
-    """The matrix from indices of an image of this (y, x) shape to those in ``orient(image, orientation)``."""
+    """Return the matrix that maps indices of an image of this (y, x) shape to indices of ``orient(image,
+    orientation)``.
+    """
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
     matrix = np.eye(3)
@@ -53,7 +56,7 @@ def orientation_matrix(orientation: str, shape: Shape) -> Array:
 
 
 def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
-    """The axis (0 = x, 1 = y) of an oriented scan along which its lines follow each other.
+    """Return the axis (0 = x, 1 = y) of an oriented scan along which its lines follow each other.
 
     Lines run along the ``fast_axis`` of the scan as it was read; x if unknown.
     """
@@ -62,7 +65,7 @@ def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
 
 
 def nearest_orientation(linear: Array) -> str:
-    """The orientation whose linear part is closest (Frobenius norm) to a 2×2 matrix."""
+    """Return the orientation whose linear part is closest (Frobenius norm) to a 2×2 matrix."""
     unit = linear / np.sqrt(abs(np.linalg.det(linear)))
 
     def distance(name: str) -> float:
@@ -72,15 +75,16 @@ def nearest_orientation(linear: Array) -> str:
 
 
 def apply_transform(matrix: Array, points: Array) -> Array:
-    """Maps (n, 2) points (x, y) by a 3×3 matrix."""
+    """Map (n, 2) points (x, y) by a 3×3 matrix."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
-    """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
+    """Return the (rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
 
-    With a bend of the target image, the result is the points whose true positions the matrix gives.
+    If the target image has a bend, the matrix gives true positions, and the result is the points at these
+    positions.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]
@@ -93,7 +97,9 @@ def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[
 def overlap_of(
     layout_to_scan: Array, layout_shape: Shape, measured: Array, bend: Bend | None = None
 ) -> Array:
-    """Which layout pixels have their centre inside the measured part of the scan, bool (ny, nx)."""
+    """Return a mask, bool (ny, nx), of the layout pixels whose centres lie inside the measured part of the
+    scan.
+    """
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
@@ -101,29 +107,29 @@ def overlap_of(
 
 
 def nearest(image: Array, rows: Array, columns: Array) -> Array:
-    """The pixels of an image (ny, nx) that lie nearest to these places."""
+    """Return the pixels of an image (ny, nx) that lie nearest to these places."""
     clipped = (np.clip(np.rint(k), 0, n - 1) for k, n in zip((rows, columns), image.shape, strict=True))
     return image[tuple(k.astype(int) for k in clipped)]
 
 
 def lattice(y: Array, x: Array) -> Array:
-    """The points (x, y) of a grid with these rows and columns, (n, 2), row by row."""
+    """Return the points (x, y) of a grid with these rows and columns, (n, 2), row by row."""
     return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
 
 
 def linear_part(matrix: Array, point: Array) -> Array:
-    """The 2×2 Jacobian of the map at a point (x, y): its local scale, rotation and shear."""
+    """Return the 2×2 Jacobian of the map at a point (x, y): its local scale, rotation and shear."""
     mapped = apply_transform(matrix, point[None])[0]
     weight = matrix[2, :2] @ point + matrix[2, 2]
     return (matrix[:2, :2] - np.outer(mapped, matrix[2, :2])) / weight
 
 
 def corners(shape: Shape) -> Array:
-    """Index coordinates (x, y) of the four corner pixels, shape (4, 2)."""
+    """Return the index coordinates (x, y) of the four corner pixels, shape (4, 2)."""
     ny, nx = shape
     return np.array([[0.0, 0], [nx - 1, 0], [0, ny - 1], [nx - 1, ny - 1]])
 
 
 def centre(shape: Shape) -> Array:
-    """Index coordinates (x, y) of the middle of an image, shape (2,)."""
+    """Return the index coordinates (x, y) of the middle of an image, shape (2,)."""
     return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])

@@ -1,4 +1,4 @@
-"""Orientation, sign and rough position, by masked normalised cross-correlation over all shifts."""
+"""Find orientation, sign and rough position by masked normalised cross-correlation over all shifts."""
 
 from dataclasses import dataclass
 
@@ -16,8 +16,8 @@ TIE = 0.02
 class Hypothesis:
     """One orientation and polarity of the scan with its best shift.
 
-    ``layout_to_oriented`` maps layout indices to indices of the oriented scan; ``ncc`` is the correlation
-    at that shift, already multiplied by the polarity.
+    ``layout_to_oriented`` maps layout indices to indices of the oriented scan. ``ncc`` is the correlation at
+    this shift, already multiplied by the polarity.
     """
 
     orientation: str
@@ -27,14 +27,14 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """All hypotheses, best first, by masked correlation of low-resolution copies.
+    """Return all hypotheses, best first, by masked correlation of low-resolution copies.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
         topography: (ny, nx) predicted topography.
 
     Returns:
-        Empty if the scan or the layout shows no structure at all.
+        The list is empty if the scan or the layout shows no structure at all.
     """
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
@@ -44,14 +44,15 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
         correlation, overlap = masked_correlation(small_topography, moving)
         if np.isnan(correlation).all():
             continue
-        # Breaks ties only: on a repeating layout, the shift with the larger overlap is the better guess.
+        # This only breaks ties: on a repeating layout, the shift with the larger overlap is the better guess.
         handicap = TIE * (1 - overlap / overlap.max())
-        # The centre of a block of `factor` pixels is (factor - 1) / 2 after its first pixel; rotating a scan
-        # whose size is no multiple of the factor moves the remainder to the other side.
+        # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the size is
+        # not a multiple of the factor, rotating a scan moves the remainder to the other side.
         cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
         for polarity in (1, -1):
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
-            # Shifts run from -(fixed size - 1) to moving size - 1, the negative ones wrapped to the end.
+            # Shifts run from -(fixed size - 1) to moving size - 1, and negative shifts are wrapped to the
+            # end.
             shift_y = int(row) - (correlation.shape[0] if row >= moving.shape[0] else 0)
             shift_x = int(column) - (correlation.shape[1] if column >= moving.shape[1] else 0)
             matrix = np.array(
@@ -63,10 +64,10 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Correlation of the best rival shift, as a share of the registration's own correlation.
+    """Return the correlation of the best rival shift, as a share of the registration's own correlation.
 
     A rival is a local maximum of the correlation over shifts at least a sixteenth of the field away. With the
-    topography in place of the scan, the result says how well the layout repeats itself.
+    topography in place of the scan, the result says how much the layout repeats itself.
     """
     from scipy.ndimage import maximum_filter
 
@@ -83,7 +84,9 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Largest correlation of the registered scan after rotation, mirroring or inversion, over all shifts."""
+    """Return the largest correlation, over all shifts, of the registered scan after rotation, mirroring or
+    inversion.
+    """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
     rivals = []
@@ -97,7 +100,9 @@ def rival_orientation(registered: Array, topography: Array) -> float:
 
 
 def reduce_image(image: Array, factor: int) -> Array:
-    """Means over blocks of ``factor`` × ``factor`` pixels, remainder cut off; NaN where half is missing."""
+    """Average blocks of ``factor`` × ``factor`` pixels, without the remainder; NaN where half of a block is
+    missing.
+    """
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
     measured = np.isfinite(blocks)
@@ -107,7 +112,7 @@ def reduce_image(image: Array, factor: int) -> Array:
 
 
 def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
-    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
+    """Return the Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
 
     D. Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Process. 21 (2012),
     doi:10.1109/TIP.2011.2181402, eq. 11.
@@ -131,14 +136,14 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     variance2 = summed(mask1, square2) - total2**2 / overlap
     covariance = summed(height1, height2) - total1 * total2 / overlap
     least = MIN_OVERLAP * min(np.isfinite(one).sum() for one in (fixed, moving))
-    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
+    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of the energy has no structure.
     usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
     product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
     return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
 
 
 def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Transforms of where an image was measured, of its heights at unit energy, and of their squares."""
+    """Transform the mask of an image's measured pixels, its heights at unit energy, and their squares."""
     from scipy.fft import rfft2
 
     measured = np.isfinite(image)

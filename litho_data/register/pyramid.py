@@ -1,4 +1,4 @@
-"""Refinement from coarse to fine, with the blur of the print matched on the way."""
+"""Refine a registration from coarse to fine, and match the blur of the print on the way."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,7 +25,9 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """The refinement and the two images that it compared: smoothed scan and blur-matched topography."""
+    """The refinement and the two images that it compared: the smoothed scan and the blur-matched
+    topography.
+    """
 
     refinement: Refinement
     scan: Array
@@ -65,7 +67,7 @@ def refine_pyramid(
 
 
 def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model: Model) -> Array:
-    """The warp, refined at a quarter and at half resolution."""
+    """Refine the warp at a quarter and at half resolution."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
         start = scale @ matrix @ np.linalg.inv(scale)
@@ -76,7 +78,9 @@ def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model:
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Factor, scan and predicted topography at a quarter and at half resolution, if large enough."""
+    """Yield factor, scan and predicted topography at a quarter and at half resolution, if they are large
+    enough.
+    """
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
@@ -88,7 +92,7 @@ def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Arra
 def match_blur(
     smooth_scan: Array, layout_level: Array, layout_to_scan: Array, bend: Bend | None = None
 ) -> float:
-    """The Gaussian sigma, layout pixels, whose topography correlates best with an aligned scan."""
+    """Find the Gaussian sigma, in layout pixels, whose topography correlates best with an aligned scan."""
     from scipy.ndimage import map_coordinates
 
     grid = warped_grid(layout_to_scan, layout_level.shape, bend)
@@ -108,7 +112,9 @@ def match_blur(
 
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
-    """The warp of a lower rung that moves the corners of the field most nearly as a given warp does."""
+    """Return the warp of a lower rung that moves the corners of the field most nearly as a given warp
+    does.
+    """
     if model == "homography":
         return matrix
     if model == "affine":
@@ -127,7 +133,7 @@ def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
 
 
 def _about(linear: Array, point: Array, image: Array) -> Array:
-    """The affine with a given linear part that takes one point to its image."""
+    """Return the affine that has a given linear part and maps one point to its image."""
     matrix = np.eye(3)
     matrix[:2, :2] = linear
     matrix[:2, 2] = image - linear @ point
@@ -135,7 +141,7 @@ def _about(linear: Array, point: Array, image: Array) -> Array:
 
 
 def _smooth(scan: Array, sigma_px: float) -> Array:
-    """The scan smoothed where measured; gaps stay NaN, because smoothing fills them without evidence."""
+    """Smooth the scan where it was measured; gaps stay NaN, because smoothing fills them without evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)
 
 
@@ -143,7 +149,7 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """The fit on the lowest rung that no higher rung beats on held-out blocks.
+    """Choose the fit on the lowest rung that no higher rung beats on held-out blocks.
 
     Args:
         fine: a converged affine fit; every rung starts from its projection.
@@ -164,7 +170,7 @@ def climb(fine: FineFit) -> FineFit:
 
 
 def held_out_energy(refinement: Refinement) -> Array:
-    """Residual energy of every block under the fit to the blocks of the other folds, (n,).
+    """Return the residual energy of every block under the fit to the blocks of the other folds, (n,).
 
     The folds interleave, so each is spread over the whole field.
     """

@@ -1,4 +1,4 @@
-"""The record of one registration, and the limits of a pass."""
+"""The record of one registration, and the limits that it must meet to pass."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -8,9 +8,9 @@ from litho_data.register.bend import Bend
 
 @dataclass(frozen=True)
 class RegistrationQuality:
-    """Figures of one registration; NaN for a figure that could not be computed.
+    """The figures of one registration; NaN for a figure that could not be computed.
 
-    Lengths in px are layout pixels; the nm figures are the same lengths times the pitch.
+    Lengths in px are layout pixels; figures in nm are the same lengths times the pitch.
     """
 
     passed: bool
@@ -58,7 +58,7 @@ class RegistrationQuality:
 # Limits of a pass; docs/registration.md gives the reason for each.
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
-# Beyond this blur of the print (sigma), the last two limits grow with the blur.
+# If the blur of the print (sigma) exceeds this, the last two limits grow with the blur.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
@@ -67,7 +67,7 @@ MAX_BEND_SLOPE = 1.0
 
 
 def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) -> tuple[bool, str, str]:
-    """(passed, reason, warning) for the figures of one registration; the reason names every failure.
+    """Return (passed, reason, warning) for the figures of one registration; the reason names every failure.
 
     Args:
         figures: figures of the fit, the warp and the evidence.
@@ -89,7 +89,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     how = "registered with a quadratic distortion"
     if bend_um is not None and bend_um.kind == "creep":
         how = "its lines creep along the slow axis, which is corrected"
-    # Written as "not >=", so that a figure that could not be computed fails.
+    # Each test is written as "not >=", so that a figure that could not be computed fails.
     failures = {
         f"correlation {ecc:.2f}, at least {MIN_ECC} wanted": not fits,
         f"ambiguous: the layout repeats itself, correlation {repeats:.2f} with its own shift": repeating,
@@ -120,7 +120,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
-    """The record of a scan without any fit, in which every figure is missing."""
+    """Make the record of a scan without any fit, in which every figure is missing."""
     empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
     figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
     return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

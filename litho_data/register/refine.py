@@ -1,9 +1,10 @@
-"""Sub-pixel refinement on the heights themselves by enhanced correlation, on any rung of the ladder.
+"""Refine a registration to sub-pixel accuracy on the heights themselves, by enhanced correlation, on any rung
+of the ladder.
 
-The correlation between the scan and the predicted topography is maximised over a warp, a gain and a
-quadratic background at once, by Gauss-Newton steps in the inverse compositional form.
-G. D. Evangelidis, E. Z. Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113;
-S. Baker, I. Matthews, IJCV 56 (2004), doi:10.1023/B:VISI.0000011205.11775.fd.
+Gauss-Newton steps in the inverse compositional form maximise the correlation between the scan and the
+predicted topography over a warp, a gain and a quadratic background at once. G. D. Evangelidis, E. Z.
+Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113; S. Baker, I. Matthews, IJCV 56 (2004),
+doi:10.1023/B:VISI.0000011205.11775.fd.
 """
 
 from collections.abc import Sequence
@@ -28,12 +29,12 @@ TOLERANCE_PX = 1e-3
 
 @dataclass(frozen=True)
 class Refinement:
-    """A converged warp, and the data for its uncertainty.
+    """A converged warp, and the data that determine its uncertainty.
 
     ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it maps to the straightened scan.
-    ``warped`` (ny, nx) float32 is the scan on the layout's pixels, gaps filled. ``gram`` (cells_y, cells_x,
-    k, k) holds, per cell of ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp)
-    and, last, the scan: any part of the field can be refitted from it without the pixels.
+    ``warped`` (ny, nx) float32 is the scan on the layout's pixels, with gaps filled. ``gram`` (cells_y,
+    cells_x, k, k) contains, for each cell of ``CELL_PX`` pixels, the inner products of the regressors (gain,
+    background, warp) and, last, the scan. Any part of the field can be refitted from it without the pixels.
     """
 
     model: Model
@@ -44,17 +45,19 @@ class Refinement:
     bend: Bend | None = None
 
     def blocks(self) -> Array:
-        """``gram`` summed over blocks, see ``in_blocks``."""
+        """Sum ``gram`` over blocks, see ``in_blocks``."""
         return in_blocks(self.gram)
 
     @property
     def background(self) -> Array:
-        """Coefficients (6,) of the quadratic surface fitted along with the warp."""
+        """Return the coefficients (6,) of the quadratic surface fitted along with the warp."""
         return solve_gram(self.gram.sum(axis=(0, 1)))[1:NUISANCES]
 
     @property
     def correlation(self) -> float:
-        """Partial correlation of scan and topography given the background; 0 if the gain is not positive."""
+        """Return the partial correlation of scan and topography given the background; 0 if the gain is not
+        positive.
+        """
         total = self.gram.sum(axis=(0, 1))
         background = total[np.ix_(_BACKGROUND_AND_SCAN, _BACKGROUND_AND_SCAN)]
         coefficients = solve_gram(total)
@@ -74,7 +77,8 @@ def refine(
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
-    """The warp of this model that maximises the correlation; the start may be off by the structures' width.
+    """Find the warp of this model that maximises the correlation; the start may be off by the structures'
+    width.
 
     Args:
         scan: (ny, nx) smoothed heights, NaN where not measured.
@@ -122,7 +126,8 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """``gram`` of a scan that is already aligned with the topography (ny, nx), NaN where not measured.
+    """Return the ``gram`` of a scan that is already aligned with the topography (ny, nx); NaN where not
+    measured.
 
     ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further``: more regressors (ny,
     nx).
@@ -134,7 +139,7 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
 
 
 def in_blocks(gram: Array) -> Array:
-    """Inner products per cell summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
+    """Sum the inner products per cell over blocks of two by two cells, (blocks_y, blocks_x, k, k).
 
     Errors of the topography extend over one or two features, so a block is the smallest independent piece.
     """
@@ -143,22 +148,24 @@ def in_blocks(gram: Array) -> Array:
 
 
 def solve_gram(gram: Array) -> Array:
-    """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
+    """Return the least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge at the regressors' float32 precision keeps at zero what the layout does not determine.
+    # A ridge at the float32 precision of the regressors keeps what the layout does not determine at zero.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
 
 def residual_energy(gram: Array, coefficients: Array) -> Array:
-    """Sum of squared residuals of given coefficients over the pixels behind inner products (…, k, k)."""
+    """Return the sum of squared residuals of given coefficients over the pixels behind inner products (…, k,
+    k).
+    """
     extended = np.concatenate([coefficients, -np.ones((*coefficients.shape[:-1], 1))], axis=-1)
     return np.einsum("...i,...ij,...j->...", extended, gram, extended)
 
 
 def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
-    """Displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
+    """Return the displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
 
     Not finite where the fitted gain of the topography is 0.
     """
@@ -171,13 +178,15 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
 
 
 def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
-    """Pixels (ny, nx) away from the border, bool."""
+    """Return a mask (ny, nx) of the pixels away from the border."""
     border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
 def _regressors(topography: Array, count: int) -> Array:
-    """(7 + count, ny, nx): topography, quadratic background, change of the topography per generator."""
+    """Return the regressors (7 + count, ny, nx): topography, quadratic background, change of the topography
+    per generator.
+    """
     shape = topography.shape
     scale = normalisation(shape)[0, 0]
     gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
@@ -199,7 +208,7 @@ def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:
     gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
     for i, (top, bottom) in enumerate(pairwise(rows)):
         for j, (left, right) in enumerate(pairwise(columns)):
-            # float64 sums: the result must not depend on how BLAS orders them.
+            # Sums are in float64, because the result must not depend on the order in which BLAS adds.
             cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(float)
             gram[i, j] = cell @ cell.T
     return gram

@@ -1,4 +1,4 @@
-"""The single resampling between a scan and the dataset: float heights, gaps kept."""
+"""The only resampling between a scan and the dataset: float heights, gaps kept."""
 
 from functools import lru_cache
 
@@ -25,7 +25,7 @@ def resample_to_layout(
     layout_pitch_um: float,
     bend_um: Bend | None = None,
 ) -> tuple[Array, Array]:
-    """Heights of a scan at the pixel centres of the layout, in one cubic-spline interpolation.
+    """Interpolate the heights of a scan once, by a cubic spline, at the pixel centres of the layout.
 
     Args:
         height_um: (ny, nx) in the scan's own frame, NaN where not measured.
@@ -43,8 +43,8 @@ def resample_to_layout(
     Raises:
         InputError: a transform that is not an invertible 3×3 matrix, or a scan without a measured pixel.
 
-    A scan sampled more finely than the layout is first averaged over the layout's pixel (Gaussian of
-    the missing width), since plain interpolation would alias its noise.
+    A scan sampled more finely than the layout is first averaged over the layout's pixel (with a Gaussian of
+    the missing width), because plain interpolation would alias its noise.
     """
     from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 
@@ -70,19 +70,21 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Share of the variance of white pixel noise left by resampling, averaged over sub-pixel positions."""
+    """Return the share of the variance of white pixel noise that resampling leaves, averaged over sub-pixel
+    positions.
+    """
     along_y, along_x = (line_variance_factor(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um)
     return along_y * along_x
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """The same along one axis, for the offsets of consecutive lines along it."""
+    """Return the same share along one axis, for the offsets of consecutive lines along it."""
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Frequencies (n,) up to Nyquist's, cycles/µm, and the squared error of a resampled wave.
+    """Return frequencies (n,) up to Nyquist's, cycles/µm, and the squared error of a resampled wave at each.
 
     The error is relative to the wave's squared amplitude and averaged over sub-pixel positions. Averaging a
     finely sampled scan over the layout's pixel does not count as an error.
@@ -97,7 +99,9 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Weights in one layout pixel of scan pixels at a distance of lag + phase pixels, (phases, lags)."""
+    """Return the weights in one layout pixel of scan pixels at a distance of lag + phase pixels, (phases,
+    lags).
+    """
     from scipy.ndimage import map_coordinates
 
     impulse = np.zeros((513, 1))
@@ -115,7 +119,8 @@ def _average_over_layout_pixel(height: Array, scan_pitch_um: YX, layout_pitch_um
 
 
 def _average_px(pitch_um: float, layout_pitch_um: float) -> float:
-    """Sigma of the Gaussian that averages a scan over the layout's pixel, scan pixels."""
-    # A box of r pixels has variance (r² - 1) / 12; below 10 % of difference the pitches count as equal.
+    """Return the sigma, in scan pixels, of the Gaussian that averages a scan over the layout's pixel."""
+    # A box of r pixels has variance (r² - 1) / 12; if the pitches differ by less than 10 % they count as
+    # equal.
     ratio = layout_pitch_um / pitch_um
     return ((ratio**2 - 1) / 12) ** 0.5 if ratio > 1.1 else 0.0

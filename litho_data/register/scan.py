@@ -1,4 +1,4 @@
-"""Registration of one scan onto the layout it was printed from."""
+"""Register one scan onto the layout from which it was printed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -32,11 +32,12 @@ from litho_data.register.topography import predicted_topography, remove_bow
 from litho_data.scan import Axis, Scan
 
 MIN_SIZE_PX = 32
-# A picometre: below the resolution of any instrument, above rounding.
+# One picometre is below the resolution of any instrument and above rounding.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend contains an affine, so a model that is stiffer by choice does not bend.
+# A bend contains an affine, so models that were chosen to be stiffer do not bend.
 BENDABLE = ("affine", "homography", "ladder")
-# A real bend accounts for nearly all of the displacement; one half separates the two cases clearly.
+# A real bend accounts for nearly all of the displacement; the limit of one half separates the two cases
+# clearly.
 BENT_SHARE = 0.5
 
 
@@ -44,12 +45,12 @@ BENT_SHARE = 0.5
 class Registration:
     """The registration of a scan on its layout.
 
-    ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's; both frames
-    have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, it is the best guess, or the
-    centred placement if there was none.
+    ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's. Both frames have
+    pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, the matrix is the best guess, or
+    the centred placement if there was no guess.
 
-    ``bend_um`` is set if the scanner has bent the scan: ``bend_um.straighten`` then gives the true position
-    of a point (x_um, y_um), and ``scan_to_layout``, the affine closest to the whole map, acts on that
+    ``bend_um`` is set if the scanner has bent the scan. Then ``bend_um.straighten`` gives the true position
+    of a point (x_um, y_um), and ``scan_to_layout``, the affine closest to the whole map, acts on this
     position.
 
     ``defects`` (ny, nx) bool, on the layout's pixels, marks where the scan shows something other than the
@@ -72,7 +73,7 @@ def register_scan(
     fast_axis: Axis | None = None,
     seed: int = 0,
 ) -> Registration:
-    """Find the warp from a scan to its layout, in any orientation and polarity, and how far to trust it.
+    """Find the warp from a scan to its layout, in any orientation and polarity, and say how far to trust it.
 
     Args:
         scan: a ``Scan``, whose pitch is used, or heights (ny, nx) in µm, NaN where not measured.
@@ -85,7 +86,7 @@ def register_scan(
 
     Raises:
         InputError: arrays that are not 2-D or smaller than 32 pixels, or pitches that are missing or not
-            positive. A fit that fails does not raise: ``quality.passed`` and ``quality.reason`` tell.
+            positive. A fit that fails does not raise; ``quality.passed`` and ``quality.reason`` report it.
     """
     if isinstance(scan, Scan):
         scan_pitch_um, fast_axis, scan = scan.require_pitch(), scan.fast_axis or fast_axis, scan.height_um
@@ -146,13 +147,15 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Whether a bend explains what the straight warp missed: within all limits, and on held-out blocks."""
+    """Return whether a bend explains what the straight warp missed: within all limits, and on held-out
+    blocks.
+    """
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan and its layout; ``known``: the figures that do not depend on the warp between them."""
+    """One scan and its layout; ``known`` contains the figures that do not depend on the warp between them."""
 
     height_um: Array
     layout: Array
@@ -163,7 +166,7 @@ class _Case:
     known: Mapping[str, float]
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
-        """The fit in µm of both frames, with its figures and the verdict; and the shifts of its blocks."""
+        """Return the fit in µm of both frames, with its figures and verdict, and the shifts of its blocks."""
         height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
@@ -184,7 +187,9 @@ class _Case:
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
     def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[Array, Bend | None]:
-        """Matrix from the layout to the (straightened) scan, µm, and the bend in the scan's own frame."""
+        """Return the matrix from the layout to the (straightened) scan, µm, and the bend in the scan's own
+        frame.
+        """
         frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
         ny, nx = self.height_um.shape
         size_um = np.array([nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]])
@@ -201,7 +206,7 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # Rounded like the matrix: no digits below physical meaning.
+        # The bend is rounded like the matrix: no digits below physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -212,7 +217,7 @@ def centred_placement(
     layout_shape: Shape,
     layout_pitch_um: float,
 ) -> Array:
-    """The ``scan_to_layout`` that puts the middle of the scan on the middle of the layout."""
+    """Return the ``scan_to_layout`` that places the middle of the scan on the middle of the layout."""
     matrix = np.eye(3)
     matrix[0, 2] = (layout_shape[1] * layout_pitch_um - scan_shape[1] * scan_pitch_um[1]) / 2
     matrix[1, 2] = (layout_shape[0] * layout_pitch_um - scan_shape[0] * scan_pitch_um[0]) / 2
@@ -229,7 +234,7 @@ def _check(height: Array, layout: Array, scan_pitch_um: YX, layout_pitch_um: flo
 
 
 def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
-    """A copy for comparison; the heights that are kept are resampled once, from the original."""
+    """Resample a copy for comparison; the heights that are stored are resampled once, from the original."""
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
     shape = _shape_at(layout_pitch_um, height.shape, scan_pitch_um)
@@ -255,13 +260,13 @@ def _on_layout(
 
 
 def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> tuple[int, int]:
-    """Size of a scan at the layout's pitch, whole pixels."""
+    """Return the size of a scan at the layout's pitch, whole pixels."""
     ny, nx = (max(1, round(n * p / layout_pitch_um)) for n, p in zip(scan_shape, scan_pitch_um, strict=True))
     return ny, nx
 
 
 def _rounded(matrix: Array) -> Array:
-    """The matrix without digits far below physical meaning, which could differ between machines."""
+    """Round off digits of the matrix far below physical meaning, which could differ between machines."""
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)

@@ -1,4 +1,6 @@
-"""Images that can be compared: the topography that a layout predicts, and a scan without gaps and bow."""
+"""Make images that can be compared: the topography that a layout predicts, and a scan without gaps and
+bow.
+"""
 
 from functools import lru_cache
 
@@ -8,7 +10,7 @@ from litho_data.foundation.kinds import Array, Shape
 
 
 def predicted_topography(layout_level: Array, blur_px: float) -> Array:
-    """The layout as the printer would render it to first order: levels blurred by a Gaussian.
+    """Predict to first order how the printer renders the layout: the levels, blurred by a Gaussian.
 
     Args:
         layout_level: (ny, nx) integer levels.
@@ -23,7 +25,7 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
 
 
 def smooth_measured(height: Array, sigma_px: float) -> Array:
-    """Gaussian smoothing by normalised convolution: gaps neither pull the mean nor spread.
+    """Smooth with a Gaussian by normalised convolution: gaps neither pull the mean nor spread.
 
     Args:
         height: (ny, nx), NaN where not measured.
@@ -40,15 +42,16 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         return gaussian_filter(height.astype(float), sigma_px)
     weight = gaussian_filter(measured.astype(float), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
-    # 1e-9 separates pixels with a few distant measured pixels in reach from pixels with rounding only.
+    # The limit 1e-9 separates pixels with a few distant measured pixels in reach from pixels with rounding
+    # only.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: Array) -> Array:
-    """The heights with every NaN replaced: extrapolated for three pixels, then constant.
+    """Replace every NaN in the heights: extrapolate for three pixels, then continue with a constant.
 
     The first pixels of a gap are the point reflection of the measured side about the nearest measured pixel.
-    So slopes continue, and an interpolating spline does not ring at the border.
+    Slopes therefore continue, and an interpolating spline does not ring at the border.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -66,10 +69,10 @@ def fill_gaps(height: Array) -> Array:
 
 
 def remove_bow(height: Array) -> Array:
-    """The heights minus their least-squares quadratic surface; only used on copies for comparison."""
+    """Subtract the least-squares quadratic surface from the heights; used only on copies for comparison."""
     basis = quadratic_basis(height.shape)
     measured = np.isfinite(height)
-    # A third of the rows and columns determines six coefficients as well as all of them.
+    # A third of the rows and columns determines six coefficients as well as all of them do.
     sparse = np.zeros_like(measured)
     sparse[::3, ::3] = measured[::3, ::3]
     chosen = sparse if sparse.sum() >= 60 else measured
@@ -79,7 +82,7 @@ def remove_bow(height: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def quadratic_basis(shape: Shape) -> Array:
-    """1, x, y, x², xy, y² over an image in coordinates from -1 to 1, read-only (6, ny, nx)."""
+    """Return 1, x, y, x², xy, y² over an image in coordinates from -1 to 1, read-only (6, ny, nx)."""
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
     one = np.ones(shape)
@@ -89,9 +92,9 @@ def quadratic_basis(shape: Shape) -> Array:
 
 
 def pearson(a: Array, b: Array) -> float:
-    """Pearson correlation of two equally long vectors, 0 if one is constant.
+    """Return the Pearson correlation of two equally long vectors, 0 if one is constant.
 
-    Plain sums instead of a matrix product: the same digits whatever the number of BLAS threads.
+    Plain sums replace a matrix product, so that the digits do not depend on the number of BLAS threads.
     """
     a, b = (values - values.mean(dtype=float) for values in (a, b))
     energy = float((a * a).sum()) * float((b * b).sum())

@@ -1,7 +1,8 @@
-"""Error of a registered scan's position, pixel by pixel, and the surface in its heights beside the print.
+"""Estimate the position error of a registered scan at each pixel, and the surface in its heights that is not
+the print.
 
 Gain, quadratic surface and warp are fitted again without each block of the field in turn (jackknife). The
-spread of the fits includes what the topography does not explain, as far as blocks differ in it.
+spread of the fits includes what the topography does not explain, as far as it differs between blocks.
 """
 
 from dataclasses import dataclass
@@ -15,14 +16,15 @@ from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
 from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
 
-# A surface is real if its terms exceed their standard errors by this factor, in root mean square. On virtual
-# prints without tilt and bow it is 1.9 at most.
+# A surface is real if the root mean square of its terms exceeds that of their standard errors by this factor.
+# On virtual prints without tilt and bow the factor is at most 1.9.
 _CLEAR = 6.0**0.5
-# Reach of the effect of surrounding print (proximity, shrinkage), layout pixels. A fit without this effect
-# takes it for a surface, alike in neighbouring blocks, so that the jackknife does not see the error.
+# How far the surrounding print has an effect (proximity, shrinkage), in layout pixels. A fit without this
+# effect takes it for a surface. The surface is similar in neighbouring blocks, so the jackknife does not see
+# the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
 # Within a cell's width of the layout's border, a print has other surroundings than inside. Their effect is
-# alike on all four sides and in all blocks there, and changes the magnification by more than the jackknife
+# the same on all four sides and in all blocks there, and changes the magnification by more than the jackknife
 # states. A field of this many cells keeps two thirds of its area without the outermost cells.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
@@ -30,7 +32,7 @@ _MAGNIFICATION = 3
 
 @dataclass(frozen=True)
 class WarpError:
-    """Errors of the fit that put a scan on its layout.
+    """The errors of the fit that places a scan on its layout.
 
     Attributes:
         covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
@@ -46,18 +48,20 @@ class WarpError:
     is_clear: bool
 
     def surface_variance(self, levelled: bool) -> float:
-        """Mean square of the surface that the heights have beside the print.
+        """Return the mean square of the surface that the heights contain in addition to the print.
 
-        The mean square of a fitted surface exceeds that of the true one by the variance of the fit. Levelling
-        has removed a surface not of the scan but of the print with its roughness. That part is in the error
-        of the fit and no longer in the heights, so after levelling the two squares add.
+        The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
+        Levelling has removed a surface not of the scan but of the print with its roughness. That part is in
+        the error of the fit and no longer in the heights, so after levelling the two squares add up.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
         return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
     def warp_variance(self, height: Array) -> Array:
-        """Variance of registered heights (ny, nx) from the error of the warp; it is largest on slopes."""
+        """Return the variance of registered heights (ny, nx) that the error of the warp causes; it is largest
+        on slopes.
+        """
         shape = height.shape
         normalise = normalisation(shape)
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
@@ -75,7 +79,7 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """The errors of a registration, and the surface beside the print.
+    """Return the errors of a registration, and the surface in the heights that is not the print.
 
     Args:
         height: (ny, nx) registered heights, NaN where not valid.
@@ -110,7 +114,7 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
 
 
 def _around(topography: Array, reach_px: float) -> Array:
-    """Gaussian mean of what surrounds each place, reflected at the border."""
+    """Return the Gaussian mean of the surroundings of each place, reflected at the border."""
     import cv2
 
     width_px = 2 * round(3 * reach_px) + 1
@@ -119,12 +123,12 @@ def _around(topography: Array, reach_px: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _products(shape: Shape) -> Array:
-    """Covariances (5, 5) of the terms of a quadratic surface over the field."""
+    """Return the covariances (5, 5) of the terms of a quadratic surface over the field."""
     return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
 
 
 def _without_each(blocks: Array) -> tuple[Array, Array]:
-    """Mean and jackknife covariance of the coefficients, from inner products (blocks, k, k)."""
+    """Return the mean and jackknife covariance of the coefficients, from inner products (blocks, k, k)."""
     without = solve_gram(blocks.sum(axis=0) - blocks)
     without[:, NUISANCES:] /= without[:, :1]
     middle = without.mean(axis=0)

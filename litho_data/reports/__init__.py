@@ -1,1 +1,1 @@
-"""Reports for people: a page of few parts, and its pictures."""
+"""Make reports for people: a page of few parts, and its pictures."""

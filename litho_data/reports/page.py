@@ -1,4 +1,6 @@
-"""Self-contained HTML reports: a verdict, pictures, folded tables (also as CSV), and how they were made."""
+"""Write self-contained HTML reports: a verdict, pictures, folded tables (also as CSV), and how they were
+made.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,13 @@ if TYPE_CHECKING:
 
     Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
 
-# Column of a table to its title and meaning; the CSV keeps the key.
+# Maps a column of a table to its title and meaning; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
 _SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
-# Columns that name a model get its colour.
+# Columns that name a model are coloured like it.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns whose values are keys, which are spelt out like the names of columns.
+# Columns whose values are keys; the keys are spelt out like the names of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -65,11 +67,11 @@ class Page:
         self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
-        """Start a section; a folded one shows only its heading until it is opened."""
+        """Start a section; a folded section shows only its heading until it is opened."""
         self._sections.append({"title": text, "folded": folded, "parts": []})
 
     def verdict(self, text: str) -> None:
-        """The answer in plain words: what is best, by how much, and whether that is more than chance."""
+        """Add the answer in plain words: what is best, by how much, and whether that is more than chance."""
         self._add("verdict", text=text)
 
     def paragraph(self, text: str) -> None:
@@ -77,24 +79,24 @@ class Page:
         self._add("paragraph", text=text)
 
     def note(self, *texts: str) -> None:
-        """One box with what the reader must not overlook; nothing without texts."""
+        """Add one box with what the reader must not overlook; without texts, add nothing."""
         if texts:
             self._add("note", texts=texts)
 
     def points(self, texts: Sequence[str]) -> None:
-        """A list of sentences."""
+        """Add a list of sentences."""
         self._add("points", texts=list(texts))
 
     def code(self, text: str) -> None:
-        """A fixed-width text."""
+        """Add a text of fixed width."""
         self._add("code", text=text)
 
     def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:
-        """The few figures that matter most: (value with unit, label)."""
+        """Add the few figures that matter most: (value with unit, label)."""
         self._add("tiles", tiles=list(tiles))
 
     def links(self, links: Sequence[tuple[str, str]]) -> None:
-        """Relative links: (target, text)."""
+        """Add relative links: (target, text)."""
         self._add("links", links=list(links))
 
     def table(
@@ -105,7 +107,7 @@ class Page:
         digits: int = 2,
         columns: Sequence[str] | None = None,
     ) -> None:
-        """A sortable table; ``write`` also saves it at full precision as ``csv_name`` beside the page.
+        """Add a sortable table; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
             table: a frame, columns by name, or rows: mappings or records. A record inside a row gets a column
@@ -128,7 +130,7 @@ class Page:
         self._tables.append((csv_name, frame, [str(column["name"]) for column in shown], digits))
 
     def figure(self, figure: Figure, caption: str) -> None:
-        """A matplotlib figure of :func:`new_figure`."""
+        """Add a matplotlib figure of :func:`new_figure`."""
         self._add("figure", caption=caption, address=svg_address(figure))
         if wanted().figures:
             self._figures.append(figure)
@@ -136,7 +138,7 @@ class Page:
     def gallery(
         self, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[str, Sequence[str]]], caption: str
     ) -> None:
-        """Small pictures in rows and columns.
+        """Add small pictures in rows and columns.
 
         Args:
             columns: title and colour bar of each.
@@ -146,7 +148,7 @@ class Page:
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page, its tables and the copies for a paper into ``folder``; returns the page's path."""
+        """Write the page, its tables and the copies for a paper into ``folder``; return the page's path."""
         target = Path(folder)
         for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
@@ -190,7 +192,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
 
 
 def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Columns and values of a row, including those of the records in it."""
+    """Yield the columns and values of a row, including those of the records in it."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):
             yield from _cells(value, digits, f"{prefix}{key}_")
@@ -211,7 +213,7 @@ def _template() -> jinja2.Template:
 
 
 def filled(template: Path, **values: object) -> str:
-    """A text from its template (Jinja) and the values that the template names."""
+    """Fill a template (Jinja) with the values that it names, and return the text."""
     return _plain(template).render(values)
 
 
@@ -240,12 +242,12 @@ def _whole_options(text: str) -> Markup:
 
 
 def capitalised(text: str) -> str:
-    """The text with a capital first letter and the rest unchanged."""
+    """Return the text with a capital first letter and the rest unchanged."""
     return text[:1].upper() + text[1:]
 
 
 def spelt_out(key: str) -> str:
-    """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
+    """Spell out the key of a column: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:
         return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")

@@ -1,4 +1,4 @@
-"""Copies of the figures and tables of a report, in the form that a paper needs."""
+"""Copy the figures and tables of a report in the form that a paper needs."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 Figures = Literal["pdf", "svg", "png"]
 Tables = Literal["csv", "latex", "markdown"]
 
-# Width of one and of two columns of a two-column page.
+# Widths of one and of two columns of a two-column page.
 _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
-# A figure wider than this on the screen is not legible in one column.
+# A figure that is wider than this on the screen is not legible in one column.
 _WIDE_INCH = 8.0
 _FONT_PT, _DPI = 7.0, 300
 
 
 @dataclass(frozen=True)
 class PaperCopies:
-    """What is written beside a report: figures in one format, tables in one format besides CSV."""
+    """What is written beside a report: figures in one format, and tables in one format besides CSV."""
 
     figures: Figures | None = None
     tables: Tables = "csv"
@@ -40,7 +40,7 @@ _WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=Non
 
 @contextmanager
 def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
-    """Reports that are written inside also write their figures and tables for a paper."""
+    """Let reports that are written inside this context also write their figures and tables for a paper."""
     token = _WANTED.set(PaperCopies(figures, tables))
     try:
         yield
@@ -49,12 +49,12 @@ def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iter
 
 
 def wanted() -> PaperCopies:
-    """The copies requested by the surrounding ``paper_copies``."""
+    """Return the copies that the surrounding ``paper_copies`` requests."""
     return _WANTED.get() or PaperCopies()
 
 
 def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that writes a report ``--figures`` and ``--tables``."""
+    """Give a command that writes a report the options ``--figures`` and ``--tables``."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -67,7 +67,9 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
-    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; changes the figures."""
+    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; this changes the
+    figures.
+    """
     if not figures:
         return
     import matplotlib

@@ -1,4 +1,4 @@
-"""Pictures of reports: figures and maps, in colours for light and dark screens."""
+"""Draw the pictures of reports: figures and maps, in colours for light and dark screens."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DARK = {
     "band": "#1d232b",
     "accent": "#6cb8ea",
 }
-# Colours of a figure that change with the screen's.
+# Colours of a figure that change with the screen's colours.
 _OF_SCREEN = ("ink", "paper", "soft", "accent")
 # One colour per model on every page; its contrast is 3:1 on light and dark paper (tests/test_report.py).
 _MODEL_COLOURS = {
@@ -58,13 +58,15 @@ _GAP = 255  # the last entry of the palette, transparent
 
 
 def model_colour(name: str) -> str:
-    """The colour of a model on every page: fixed for the project's models, else derived from the name."""
+    """Return the colour of a model on every page: fixed for the project's models, otherwise derived from the
+    name.
+    """
     known = _MODEL_COLOURS.get(name)
     return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
 
 
 def new_figure(width_inch: float, height_inch: float) -> Figure:
-    """A figure outside pyplot's global state, so that reports never leak memory or need a display."""
+    """Make a figure outside pyplot's global state, so that reports never leak memory or need a display."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -74,12 +76,12 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
 
 
 def svg_address(figure: Figure) -> str:
-    """Data address of a figure as SVG; its colours of ``LIGHT`` change with the screen."""
+    """Return the data address of a figure as SVG; its colours of ``LIGHT`` change with the screen."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
     figure.dpi = _PICTURE_DPI
-    # Not savefig, which lays out and draws everything twice.
+    # savefig is not used, because it lays out and draws everything twice.
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     for word in _OF_SCREEN:
@@ -92,7 +94,7 @@ def svg_address(figure: Figure) -> str:
 
 
 def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
-    """Data address of an image in one of matplotlib's colour maps, transparent where it is NaN.
+    """Return the data address of an image in one of matplotlib's colour maps, transparent where it is NaN.
 
     Args:
         image: (ny, nx), one value per pixel of the picture.
@@ -113,24 +115,25 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
 
 
 def limits(image: Array) -> tuple[float, float]:
-    """Lowest and highest value of a picture, except for a few outliers."""
+    """Return the lowest and highest value of a picture, ignoring a few outliers."""
     low, high = np.nanpercentile(image, (0.5, 99.5))
     return float(low), float(high)
 
 
 def thumbnail(image: Array, side_px: int = 180) -> Array:
-    """Every n-th pixel of an image (ny, nx), so that no side has more than ``side_px``."""
+    """Take every n-th pixel of an image (ny, nx), so that no side has more than ``side_px``."""
     step = max(1, -(-max(image.shape) // side_px))
     return image[::step, ::step]
 
 
 def colour_bar_png(colours: str) -> str:
-    """The colours from low to high, one pixel high, to be stretched."""
+    """Return a picture of the colours from low to high, one pixel high, which is stretched for display."""
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
 
 
 def shown_html(line: str, **images: Array) -> str:
-    """What a notebook shows of an object with maps: the line of its ``repr``, then each map with its range.
+    """Return what a notebook shows of an object with maps: the line of its ``repr``, then each map with its
+    range.
 
     Args:
         line: the line.

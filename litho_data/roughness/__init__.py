@@ -1,4 +1,6 @@
-"""Roughness and noise of scans: amplitudes, spectra, correlation, step heights, and what levelling hides."""
+"""Measure roughness and noise of scans: amplitudes, spectra, correlation, step heights, and what levelling
+hides.
+"""
 
 from litho_data.roughness.amplitude import (
     AmplitudeParameters,

@@ -1,4 +1,4 @@
-"""Amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
+"""Compute the amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
 
 import numpy as np
 import scipy.fft
@@ -9,7 +9,7 @@ from litho_data.foundation.results import Record
 
 
 class AmplitudeParameters(Record):
-    """Amplitudes about the mean height; they hold for one pitch, field of view and levelling only.
+    """Amplitudes about the mean height; they are valid for one pitch, field of view and levelling only.
 
     Args:
         sa_nm: mean absolute deviation.
@@ -29,7 +29,7 @@ class AmplitudeParameters(Record):
 
 
 def amplitude_parameters(height_um: Array, valid: Array | None = None) -> AmplitudeParameters:
-    """Sa, Sq, Ssk, Sku and Sz of a levelled surface.
+    """Return Sa, Sq, Ssk, Sku and Sz of a levelled surface.
 
     Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴ with h about the mean.
 
@@ -46,7 +46,7 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
         raise InputError("surface", got="no valid pixel", wanted="at least one")
     deviation = height_nm - height_nm.mean()
     sq_nm = float(np.sqrt(np.mean(deviation**2)))
-    # Rounding of the mean leaves 1e-16 of the height; a surface with less is flat.
+    # Rounding of the mean leaves 1e-16 of the height; a surface with less variation is flat.
     flat = sq_nm <= 1e-12 * max(1.0, float(np.abs(height_nm).max()))
     return AmplitudeParameters(
         sa_nm=float(np.abs(deviation).mean()),
@@ -59,13 +59,14 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
 
 
 def autocorrelation(height_um: Array) -> Array:
-    """Normalised autocorrelation for lags of 0 … half the field, shape (ny // 2, 2 (nx // 2) − 1).
+    """Return the normalised autocorrelation for lags from 0 to half the field, shape (ny // 2, 2 (nx // 2) −
+    1).
 
-    Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx // 2 − 1)`` columns; the sum at each
-    lag is divided by the number of pixel pairs.
+    Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx // 2 − 1)`` columns. The sum at each lag is
+    divided by the number of pixel pairs.
 
     Raises:
-        InputError: NaN in the surface, or a flat one.
+        InputError: NaN in the surface, or constant heights.
     """
     if not np.isfinite(height_um).all():
         raise InputError("surface", got="NaN", wanted="finite heights for an autocorrelation")
@@ -78,25 +79,27 @@ def autocorrelation(height_um: Array) -> Array:
     pairs = np.outer(ny - rows, nx - np.abs(columns))
     covariance = products[np.ix_(rows, columns)] / pairs
     if covariance[0, nx // 2 - 1] <= 0:
-        raise InputError("surface", got="a flat one", wanted="heights that vary")
+        raise InputError("surface", got="constant heights", wanted="heights that vary")
     return covariance / covariance[0, nx // 2 - 1]
 
 
 def effective_samples(height_um: Array) -> float:
-    """Number of independent heights in a field, for its variance: pixels / Σ ρ² over all lags.
+    """Return the number of independent heights in a field, for its variance: pixels / Σ ρ² over all lags.
 
-    The estimate of a mean square has relative variance ``2 Σ ρ² / pixels`` for a Gaussian surface. Lags
+    For a Gaussian surface, an estimated mean square has the relative variance ``2 Σ ρ² / pixels``. Lags
     beyond a quarter of the field are left out, because ρ² there is noise of the estimate.
     """
     correlation = autocorrelation(height_um)
     rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
     centre = correlation.shape[1] // 2
     near = correlation[:rows, centre - columns : centre + columns + 1]
-    # The half plane of negative row lags mirrors the positive one.
+    # The half plane of negative row lags mirrors that of positive row lags.
     total = 2 * np.sum(near**2) - np.sum(near[0] ** 2)
     return float(min(height_um.size, max(1.0, height_um.size / total)))
 
 
 def sq_uncertainty_nm(height_um: Array) -> float:
-    """Standard uncertainty of Sq from the finite field: ``Sq / √(2 n_eff)``, nm (Gaussian heights)."""
+    """Return the standard uncertainty of Sq that the finite field causes: ``Sq / √(2 n_eff)``, nm (Gaussian
+    heights).
+    """
     return amplitude_parameters(height_um).sq_nm / float(np.sqrt(2 * effective_samples(height_um)))

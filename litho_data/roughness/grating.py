@@ -1,4 +1,6 @@
-"""The period of a grating: where the spectrum peaks, then how its phase advances over the field."""
+"""Find the period of a grating: first where its spectrum peaks, then how its phase advances over the
+field.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +12,13 @@ from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
-# The period that an uncalibrated scanner shows is within this factor of the true one.
+# The period that an uncalibrated scanner shows differs from the true period by at most this factor.
 SEARCHED = 1.25
-# A window of two periods is blind to the mean and to all harmonics; phases need a few of them side by side.
+# A window of two periods is blind to the mean and to all harmonics; phases need several windows side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
-# Phases of noise scatter by 1.8 rad.
+# The limit is far below 1.8 rad, by which the phases of noise scatter.
 _MOST_SCATTER_RAD = 0.5
-# Neighbouring windows overlap by half: their noise is correlated by 1/6, on both sides.
+# Neighbouring windows overlap by half, so their noise is correlated by 1/6 on both sides.
 _OVERLAP_VARIANCE = 1 + 2 / 6
 
 
@@ -37,11 +39,11 @@ class Scale(Record):
 
 
 def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> Wave:
-    """The fundamental of a grating whose period lies along an axis, to a few degrees.
+    """Find the fundamental wave of a grating whose period lies along an axis, to within a few degrees.
 
-    The phase is measured in windows of two periods (Hann along the axis, all of the other axis). Its slope
-    along the axis corrects the frequency; the scatter of the phases about the line gives the uncertainty from
-    noise, drift and a bent scanner axis together.
+    The phase is measured in windows of two periods (Hann along the axis, all of the other axis). The slope of
+    the phase along the axis corrects the frequency. The scatter of the phases about the line gives the
+    uncertainty from noise, drift and a bent scanner axis together.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -68,7 +70,7 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
         if not scatter < _MOST_SCATTER_RAD:
             raise InputError(
                 f"grating along {axis}",
-                got=f"nothing that repeats every {period_um:g} µm (its phase scatters by {scatter:.1f} rad)",
+                got=f"nothing that repeats every {period_um:g} µm (the phase scatters by {scatter:.1f} rad)",
                 wanted="a scan of a grating of this period",
             )
         at = at + step
@@ -77,7 +79,8 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
 
 def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
-    """How far the middle of a line is displaced along x relative to its ends, µm; and its uncertainty.
+    """Return how far the middle of a line is displaced along x relative to its ends, µm, with its
+    uncertainty.
 
     A pixel at x of a line of length L shows what lies at x + 4 b (x / L) (1 - x / L), up to shift and scale.
 
@@ -96,10 +99,10 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
 
 
 def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
-    """Scales of the axes whose gratings were measured, for a scanner without shear.
+    """Return the scales of the axes whose gratings were measured, for a scanner without shear.
 
-    If stated lengths are c times too short, a frequency is c times too high. So (x / c_x)² + (y / c_y)² is
-    the square of the true frequency, at whatever angle a grating lies.
+    If stated lengths are c times too short, a frequency is c times too high. The square of the true frequency
+    is therefore (x / c_x)² + (y / c_y)², whatever the angle of the grating.
 
     Args:
         waves: measured wave, known period and its standard uncertainty (µm) of each grating.
@@ -119,7 +122,7 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
 
 
 def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
-    """Strongest frequency (along, across) within the range, and within 15° of the axis."""
+    """Return the strongest frequency (along, across) within the range and within 15° of the axis."""
     ny, nx = flat.shape
     windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
     power = np.abs(np.fft.fft2(windowed)[:, : nx // 2 + 1]) ** 2
@@ -133,12 +136,14 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """Error of the frequency (along, across), the uncertainty of the first, and the scatter in rad."""
+    """Return the error of the frequency (along, across), the uncertainty of the first value, and the scatter
+    in rad.
+    """
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
     places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
     slope, error, scatter = _line(places, phases)
-    # Across the axis, four bands are enough for a small angle; in each, the other waves average out.
+    # Across the axis, four bands are enough for a small angle; in each band the other waves average out.
     window = np.hanning(len(x))
     bands = [band @ window for band in np.array_split(carried, 4)]
     centres = np.array([band.mean() for band in np.array_split(y, 4)])
@@ -156,12 +161,14 @@ def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array
 
 
 def _line(places: Array, phases: Array) -> tuple[float, float, float]:
-    """Slope, its standard uncertainty, and scatter of phases about a straight line."""
+    """Fit a straight line to phases; return its slope, the slope's standard uncertainty, and the scatter."""
     return _last_weight([np.ones_like(places), places - places.mean()], phases)
 
 
 def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
-    """Weight of the last column in a least-squares fit, its standard uncertainty, and the scatter."""
+    """Return the weight of the last column in a least-squares fit, its standard uncertainty, and the
+    scatter.
+    """
     design = np.column_stack(columns)
     weights, *_ = np.linalg.lstsq(design, values, rcond=None)
     rest = values - design @ weights
@@ -172,5 +179,7 @@ def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, flo
 
 
 def _wider(freedom: int) -> float:
-    """Factor for the uncertain scatter of a few phases: how much wider Student's t is with this freedom."""
+    """Return how much wider Student's t is with this freedom, as a factor for the uncertain scatter of a few
+    phases.
+    """
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

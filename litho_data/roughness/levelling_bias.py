@@ -1,8 +1,10 @@
-"""How levelling lowers Sq: it removes some of the roughness together with the background.
+"""Compute how much levelling lowers Sq, because it removes some of the roughness together with the
+background.
 
-Least squares on a basis Q (orthonormal over the N pixels) leaves a surface with correlation matrix C
-the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. This is exact for any polynomial background and
-any autocorrelation (compare arXiv:2001.00433, which treats the same bias for polynomials).
+After a least-squares fit on a basis Q (orthonormal over the N pixels) is subtracted, a surface with
+correlation matrix C has the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. The formula is exact for any
+polynomial background and any autocorrelation (compare arXiv:2001.00433, which treats the same bias for
+polynomials).
 """
 
 from collections.abc import Callable
@@ -17,12 +19,12 @@ Correlation = Callable[[Array, Array], Array]
 
 
 def gaussian_correlation(length_um: float) -> Correlation:
-    """``exp(−r²/T²)``: falls to 1/e at ``length_um``."""
+    """Return ``exp(−r²/T²)``, which falls to 1/e at ``length_um``."""
     return lambda y_um, x_um: np.exp(-(y_um**2 + x_um**2) / length_um**2)
 
 
 def exponential_correlation(length_um: float) -> Correlation:
-    """``exp(−r/T)``: falls to 1/e at ``length_um``."""
+    """Return ``exp(−r/T)``, which falls to 1/e at ``length_um``."""
     return lambda y_um, x_um: np.exp(-np.hypot(y_um, x_um) / length_um)
 
 
@@ -33,9 +35,9 @@ def retained_variance(
     *,
     degree: int | tuple[int, int],
 ) -> float:
-    """Expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
+    """Return the expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
 
-    Sq of a levelled surface is too low by the square root of this share; divide by the root to correct.
+    Sq of a levelled surface is too low by the square root of this share; divide by the root to correct it.
 
     Args:
         shape: (ny, nx), pixels; (1, nx) with a degree of (0, n) for rows that are levelled separately.
@@ -60,7 +62,9 @@ def retained_variance(
 
 
 def _orthonormal_polynomials(size: int, degree: int) -> Array:
-    """Polynomials of degree 0…``degree``, orthonormal over ``size`` pixels, shape (degree + 1, size)."""
+    """Return polynomials of degree 0…``degree``, orthonormal over ``size`` pixels, shape (degree + 1,
+    size).
+    """
     if not 0 <= degree < size:
         raise InputError("degree of a levelling polynomial", got=degree, wanted=f"0 to {size - 1}")
     columns = np.polynomial.legendre.legvander(np.linspace(-1, 1, size), degree)

@@ -1,4 +1,4 @@
-"""Noise of pixels and of scan lines, separated from the print."""
+"""Separate the noise of pixels and of scan lines from the print."""
 
 from math import comb
 
@@ -8,18 +8,21 @@ from litho_data.foundation.kinds import Array
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
-# Median absolute deviation of a Gaussian: 0.6745 sd.
+# The median absolute deviation of a Gaussian is 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
-# Passes half of the amplitude at 0.84 of the Nyquist frequency, a fiftieth at 0.56 (0.28 cycles per pixel).
+# Differences of this order pass half of the amplitude at 0.84 of the Nyquist frequency, and a fiftieth at
+# 0.56 (0.28 cycles per pixel).
 _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
-    """Pixel noise and line noise of a scan of any print, nm: whatever is white at the finest scales.
+    """Estimate the pixel noise and line noise of a scan of any print, nm: whatever is white at the finest
+    scales.
 
-    A printer writes nothing finer than its spot, so differences of high order leave only noise: along both
-    axes that of the pixels, of the line means along the slow axis that of the lines. Line noise that is
-    correlated over lines (drift) and noise that the feedback smooths look like the print and are not counted.
+    A printer writes nothing finer than its spot, so differences of high order leave only noise. Along both
+    axes it is that of the pixels; in the line means along the slow axis it is that of the lines. Line noise
+    that is correlated over lines (drift), and noise that the feedback smooths, look like the print and are
+    not counted.
 
     Args:
         height_um: heights, µm, shape (ny, nx), NaN where not measured.
@@ -42,7 +45,9 @@ def _fine(values: Array, axis: int) -> Array:
 
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
-    """Differences of an order along an axis: white noise keeps its variance, lower polynomials vanish."""
+    """Return differences of an order along an axis: white noise keeps its variance, lower polynomials
+    vanish.
+    """
     return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 
 
@@ -51,6 +56,6 @@ def _fine_sd(differences: Array) -> float:
 
 
 def robust_sd(values: Array) -> float:
-    """Standard deviation from the median absolute deviation, NaN left out; NaN without values."""
+    """Return the standard deviation from the median absolute deviation, ignoring NaN; NaN without values."""
     known = values[np.isfinite(values)]
     return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

@@ -1,4 +1,4 @@
-"""Power spectral densities whose integral is the variance."""
+"""Compute power spectral densities whose integral is the variance."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -24,9 +24,9 @@ class Spectrum:
 
 
 def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
-    """One-sided power spectral density along one axis, averaged over the lines.
+    """Return the one-sided power spectral density along one axis, averaged over the lines.
 
-    Mean and slope of each line are removed, and the line is weighted by a Hann window, whose power is divided
+    Mean and slope of each line are removed. The line is weighted by a Hann window, whose power is divided
     out. The spectrum is scaled so that ``Σ density·Δf`` is the mean square of the lines.
 
     Args:
@@ -48,13 +48,13 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
 
 
 def hann(shape: Shape) -> Array:
-    """Hann window of a field (ny, nx), nowhere zero."""
+    """Return the Hann window of a field (ny, nx), which is zero nowhere."""
     ny, nx = shape
     return np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
 
 
 def lines_nm(height_um: Array, axis: Axis) -> Array:
-    """Profiles along an axis as rows, nm.
+    """Return the profiles along an axis as rows, nm.
 
     Raises:
         InputError: another axis.

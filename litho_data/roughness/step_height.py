@@ -1,4 +1,6 @@
-"""Step heights line by line in the windows of ISO 5436-1, away from the edges, with one common slope."""
+"""Measure step heights line by line in the windows of ISO 5436-1, away from the edges, with one common
+slope.
+"""
 
 from collections.abc import Sequence
 
@@ -32,10 +34,10 @@ class StepHeight(Record):
 
 
 def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um: float) -> StepHeight:
-    """Height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
+    """Return the height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
 
-    On every line ``z = a·x + b + h·δ`` is fitted with δ = 1 on the middle third of the feature and
-    δ = 0 on two reference arms. If W is the width of the feature, the arms lie W/3 to W off its edges, so
+    ``z = a·x + b + h·δ`` is fitted to every line, with δ = 1 on the middle third of the feature and δ = 0 on
+    two reference arms. If W is the width of the feature, the arms lie between W/3 and W from its edges, so
     that the profile spans three widths.
 
     Args:
@@ -53,7 +55,7 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
         raise InputError(
             "edges of a groove",
             got=f"{left_um:g} and {right_um:g} µm",
-            wanted=f"left < right with one width to spare on both sides of {extent_um:g} µm",
+            wanted=f"left < right, and one width free on both sides within {extent_um:g} µm",
         )
     third_um = width_um / 3
     feature = (position_um >= left_um + third_um) & (position_um <= right_um - third_um)
@@ -65,10 +67,10 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
 def stair_steps(
     height_um: Array, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
 ) -> list[StepHeight]:
-    """Heights of the steps of a staircase, one per edge, positive upwards.
+    """Return the heights of the steps of a staircase, one per edge, positive upwards.
 
-    On every line one height per tread and one common slope are fitted to the middle thirds of the
-    treads; a step is the difference of two neighbouring treads.
+    On every line, one height per tread and one common slope are fitted to the middle thirds of the treads. A
+    step is the difference of two neighbouring treads.
 
     Args:
         edges_um: positions of the edges along the axis, ascending, µm.
@@ -98,7 +100,7 @@ def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Arr
 
 
 def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[StepHeight]:
-    """Differences of neighbouring treads, line by line, with one slope per line."""
+    """Return the differences of neighbouring treads, line by line, with one slope per line."""
     used = np.any(treads, axis=0)
     design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
         used
@@ -128,7 +130,7 @@ def _summary(step_nm: Array) -> StepHeight:
 
 
 def _independent_lines(values: Array) -> float:
-    """n / (1 + 2 Σ ρ) with the sum up to the first negative ρ (initial positive sequence)."""
+    """Return n / (1 + 2 Σ ρ), with the sum up to the first negative ρ (initial positive sequence)."""
     deviation = values - values.mean()
     correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
     negative = np.flatnonzero(correlation < 0)
@@ -137,11 +139,11 @@ def _independent_lines(values: Array) -> float:
 
 
 def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
-    """Mean height of the edges of a step, ridge, groove or row of grooves, wherever they are.
+    """Return the mean height of the edges of a step, ridge, groove or row of grooves, wherever they are.
 
-    Edges are where the median profile, without the slope of the field, changes by at least half of its
-    largest change; their heights come from ``stair_steps`` and are averaged without sign. The edges of one
-    scan share their treads, so the uncertainty of the mean is taken as that of one edge.
+    An edge is where the median profile, without the slope of the field, changes by at least half of its
+    largest change. The heights come from ``stair_steps`` and are averaged without sign. The edges of one scan
+    share their treads, so the uncertainty of the mean is taken as that of one edge.
 
     Raises:
         InputError: no edge stands out of the profile, or edges closer than three pixels.

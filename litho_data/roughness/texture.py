@@ -1,4 +1,4 @@
-"""Whether a surface has lines: in which direction, and whether they repeat."""
+"""Find whether a surface has lines, in which direction, and whether they repeat."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ FEWEST_LINES = 64
 # A peak is compared with the frequencies around it, beyond its own width under a Hann window.
 _AROUND = 16
 _OWN = 3
-# Share of independent powers: under a Hann window, powers 0, 1, 2 frequencies apart correlate by 1, 4/9,
+# Share of independent powers: under a Hann window, powers 0, 1 or 2 frequencies apart correlate by 1, 4/9 or
 # 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# The lowest frequencies hold what levelling leaves of a bow.
+# The lowest frequencies contain what levelling leaves of a bow.
 _FIRST = 3
 
 
@@ -60,11 +60,11 @@ class LinePeriod:
 
 
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
-    """Direction in which surfaces change least, from their power spectra.
+    """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) is weighted by its power and enters at twice its angle; each surface is scaled by
-    its own variance. Random surfaces have independent exponential powers, so the mean vector of an isotropic
-    one is normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
+    Each frequency (fx, fy) is weighted by its power and enters at twice its angle. Each surface is scaled by
+    its own variance. Random surfaces have independent exponential powers. The mean vector of an isotropic
+    surface is therefore normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
 
     Args:
         heights_um: (ny, nx) µm on square pixels, levelled; NaN counts as the mean.
@@ -74,7 +74,7 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """
     vectors, variances = zip(*(_mean_vector(height) for height in heights_um), strict=True)
     vector, variance = np.mean(vectors), np.mean(variances) / len(heights_um)
-    # The power lies across the lines.
+    # In the spectrum, the power of lines lies across the lines.
     across = 0.5 * float(np.degrees(np.angle(vector)))
     return LineDirection(
         angle_deg=across - 90 if across > 0 else across + 90,
@@ -84,7 +84,9 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
 
 
 def _mean_vector(height_um: Array) -> tuple[complex, float]:
-    """Mean double-angle vector of the power of a surface, and its variance if the surface is isotropic."""
+    """Return the mean double-angle vector of the power of a surface, and its variance if the surface is
+    isotropic.
+    """
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
         raise InputError("surface", got=height.shape, wanted=f"at least {FEWEST_LINES} rows and columns")
@@ -106,7 +108,7 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
 
 
 def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
-    """The strongest period that the line means of all scans have in common; None below 64 lines.
+    """Find the strongest period that the line means of all scans have in common; return None below 64 lines.
 
     If lines are random, the mean periodogram of F scans divided by its level is distributed as Gamma(F) / F.
     The level is a parabola through the logarithms at the surrounding frequencies, and its uncertainty is
@@ -145,7 +147,9 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """Level at each frequency from those around it, and the chance of a peak so far above the level."""
+    """Return the level at each frequency, estimated from those around it, and the chance of a peak so far
+    above it.
+    """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)
     level, chance = np.empty(len(power)), np.empty(len(power))

@@ -1,1 +1,1 @@
-"""Independent jobs shared among processes and machines."""
+"""Share independent jobs among processes and machines."""

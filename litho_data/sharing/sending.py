@@ -1,4 +1,4 @@
-"""A function and its job on the way to another process, and the result on the way back."""
+"""Send a function and its job to another process, and the result back."""
 
 import contextlib
 import ctypes
@@ -23,7 +23,7 @@ _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20
 class Known:
     """Large objects that other processes make for themselves; jobs and results refer to them by name.
 
-    ``make`` makes ``objects`` again; it must be importable by name, such as a partial. A process keeps the
+    ``make`` makes ``objects`` again; it must be importable by name, as a partial is. A process keeps the
     objects that it made last.
     """
 
@@ -35,7 +35,7 @@ class Known:
 class Away:
     """A function as another process runs it: in the same folder, for results with the same command line.
 
-    ``plugins``: files of plug-ins to load first; ``software``: what a Dask worker has to run too.
+    ``plugins`` are files of plug-ins to load first; ``software`` is what a Dask worker must run too.
     """
 
     function: Callable[[Any], Any]
@@ -63,7 +63,9 @@ def _made(make: bytes) -> Mapping[str, Any]:
 
 
 def sent(content: Any, names: Mapping[int, str]) -> bytes:
-    """Anything as bytes; ``names``: names by ``id`` of the objects that are sent as their name only."""
+    """Convert anything to bytes; ``names`` maps the ``id`` of objects that are sent as a name to this
+    name.
+    """
     stream = BytesIO()
     _Sender(stream, names).dump(content)
     return stream.getvalue()
@@ -93,7 +95,9 @@ class _Receiver(pickle.Unpickler):
 
 
 def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
-    """Refuse a Dask worker whose results would differ; checked with each job, as workers come and go."""
+    """Refuse a Dask worker whose results would differ; this is checked with each job, as workers come and
+    go.
+    """
     from distributed import get_worker
 
     worker = get_worker()
@@ -127,7 +131,7 @@ def _keep_freed_memory() -> None:
     """Let a Dask worker use freed memory again, as other processes do.
 
     Dask starts its workers with MALLOC_TRIM_THRESHOLD_, so that every array above 128 KiB gets new pages.
-    That takes a third of the time of a build.
+    Making these pages takes a third of the time of a build.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)):
         for parameter, value in _MALLOC.values():

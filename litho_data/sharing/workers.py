@@ -1,4 +1,4 @@
-"""Independent jobs in this process, in local processes, or on a Dask cluster, a few at a time."""
+"""Run independent jobs in this process, in local processes, or on a Dask cluster, a few at a time."""
 
 import asyncio
 import os
@@ -37,9 +37,10 @@ _TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that take jobs: their present number, and the errors that mean a job was lost with its worker.
+    """Workers that take jobs: their present number, and the errors that mean that a job was lost with its
+    worker.
 
-    ``tries``: how often a job is begun; ``restart``: called before lost jobs are begun again.
+    ``tries`` is how often a job is begun; ``restart`` is called before lost jobs are begun again.
     """
 
     submit: Callable[..., Future[bytes]]
@@ -52,7 +53,8 @@ class Pool(NamedTuple):
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run. Results are the same to the bit if each process has the same number of threads.
+    """Where jobs run: in this process, in local processes, or on a Dask cluster. Results are identical bit by
+    bit if each process has the same number of threads.
 
     Attributes:
         processes: number of local processes, with one thread each unless the environment says otherwise; 1 is
@@ -73,7 +75,7 @@ class Workers:
 
     @property
     def elsewhere(self) -> bool:
-        """Whether jobs leave this process."""
+        """Return whether jobs leave this process."""
         return self.dask is not None or self.processes > 1
 
 
@@ -88,7 +90,7 @@ def run_jobs(
     name: Callable[[J], str] = str,
     apart: bool = False,
 ) -> Generator[tuple[J, R], None, None]:
-    """Each job with its result, in the order in which they are finished.
+    """Yield each job with its result, in the order in which the jobs are finished.
 
     At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
     worker died is run again, alone, at most twice; Dask repeats it as often as its scheduler allows.
@@ -123,7 +125,7 @@ def run_jobs(
 def _tried(
     submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
 ) -> Iterator[tuple[int, R]]:
-    """The numbers of jobs with their answers; jobs lost with a worker are tried again, one by one."""
+    """Yield the numbers of jobs with their answers; jobs lost with a worker are tried again, one by one."""
     tries: Counter[int] = Counter()
 
     def begin(number: int) -> Future[R]:
@@ -162,7 +164,8 @@ def _tried(
 
 @contextmanager
 def kept_open(workers: Workers) -> Iterator[Workers]:
-    """The same workers, started once for all jobs of the block; workers that cannot start raise at once.
+    """Yield the same workers, started once for all jobs of the block; workers that cannot start raise at
+    once.
 
     Raises:
         InputError: no scheduler at the address, or no worker there.
@@ -177,7 +180,7 @@ def kept_open(workers: Workers) -> Iterator[Workers]:
 def _windowed(
     submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
 ) -> Iterator[tuple[J, Future[R]]]:
-    """Jobs as they finish, with two in progress for each of ``count()`` workers."""
+    """Yield jobs as they finish, with two in progress for each of ``count()`` workers."""
     waiting = iter(jobs)
     running: dict[Future[R], J] = {}
 
@@ -206,7 +209,7 @@ def _local(count: int, apart: bool) -> Iterator[Pool]:
     def opened() -> Executor:
         if apart:
             return ThreadPoolExecutor(count)
-        # Spawned, because a forked copy of a process with threads may hang.
+        # Processes are spawned, because a forked copy of a process with threads may hang.
         return ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
 
     def restart() -> None:
@@ -232,7 +235,9 @@ def _local(count: int, apart: bool) -> Iterator[Pool]:
 
 
 def _die_with_parent() -> None:
-    """End this worker with its parent; after a killed parent it would wait forever for its next job."""
+    """End this worker with its parent; if the parent is killed, it would otherwise wait forever for its next
+    job.
+    """
     from multiprocessing import parent_process
 
     def watch() -> None:
@@ -284,13 +289,15 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Check what answers at the address: a client that meets another program waits long, then crashes."""
+    """Check what answers at the address, because a client that meets another program waits long, then
+    crashes.
+    """
     from distributed.core import rpc
 
     async def ask() -> None:
         async with rpc(address) as scheduler:
             await asyncio.wait_for(scheduler.identity(), _CONNECT_S)
 
-    # In a thread of its own, because a notebook already runs an event loop.
+    # The check runs in a separate thread, because a notebook already runs an event loop.
     with ThreadPoolExecutor(1) as thread:
         thread.submit(asyncio.run, ask()).result()

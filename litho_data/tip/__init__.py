@@ -1,4 +1,4 @@
-"""The tip of the microscope, estimated from its scans: its radius, and where it did not touch."""
+"""Estimate the tip of the microscope from its scans: its radius, and where it did not touch."""
 
 from litho_data.tip.certainty import reconstructed, tip_certain
 from litho_data.tip.estimate import TipEstimate, estimate_tip

@@ -1,8 +1,8 @@
-"""Which pixels of a surface the tip touched, and the surface under the image.
+"""Find which pixels of a surface the tip touched, and the surface behind the image.
 
 The point where the tip touches determines the image. Where the surface curves upward more sharply than the
-tip, the contact jumps from one side of a valley to the other. What lies between was not touched, and the
-image shows it as a single pixel: a valley with a curvature beyond that of the tip. The untouched pixels are
+tip, the contact jumps from one side of a valley to the other. The surface between was not touched, and the
+image shows it as a single pixel: a valley whose curvature exceeds that of the tip. The untouched pixels are
 those whose highest possible height is set by such a valley (Villarrubia 1997, section 5).
 """
 
@@ -21,21 +21,22 @@ from litho_data.tip.curvature import (
 )
 from litho_data.tip.morphology import paraboloid_erosion
 
-# Curvature of a valley in units of the tip's: from the first on it may be a jump, from the second on it is
+# Curvature of a valley in units of the tip's: above the first value it may be a jump, above the second it is
 # one. The image of a valley of curvature k has k / (1 − kR), so 0.6 of the tip's curvature means 0.375 in the
 # surface. If noise requires a disc as wide as the valley, the disc underestimates the curvature; noise alone
 # reaches 0.6 at 3.5 sd.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
-# A disc shows a jump, weaker, up to its radius away; the jump is where it exceeds this share of its peak.
+# A disc shows a jump, weakened, up to its radius away; the jump is where the signal exceeds this share of its
+# peak.
 _CORE = 0.55
 _SMOOTHING = 0.25
 
 
 def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Pixels of the surface that the tip touched, bool (ny, nx), with one pixel to spare.
+    """Return the pixels of the surface that the tip touched, bool (ny, nx), with a margin of one pixel.
 
-    If the radius is only an upper bound, more pixels than necessary are uncertain. False where nothing was
-    measured.
+    If the radius is only an upper bound, more pixels than necessary count as uncertain. Unmeasured pixels are
+    False.
 
     Args:
         height_um: image (ny, nx), µm, NaN where not measured.
@@ -65,10 +66,10 @@ def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
 
 
 def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """The highest surface that gives this image, (ny, nx) µm: the image eroded by the tip.
+    """Return the highest surface that gives this image, (ny, nx) µm: the image eroded by the tip.
 
-    It equals the surface where the tip touched and lies above it elsewhere. Noise is treated as surface: its
-    valleys widen to the width of the tip, which lowers the result by up to the noise.
+    This surface equals the true one where the tip touched, and lies above it elsewhere. Noise is treated as
+    surface: its valleys widen to the width of the tip, which lowers the result by up to the noise.
 
     Args:
         height_um, pitch_um, radius_um: as for ``tip_certain``.

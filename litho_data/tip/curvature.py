@@ -1,4 +1,4 @@
-"""Noise of a scan, and curvatures over small discs with their noise."""
+"""Estimate the noise of a scan, and the curvatures over small discs with their noise."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,10 +24,11 @@ class Noise:
 
 
 def noise_of(height_um: Array) -> Noise:
-    """Noise of a scan (ny, nx), µm, from fourth differences, which vanish on a parabola, as a tip leaves it.
+    """Estimate the noise of a scan (ny, nx), µm, from fourth differences, which vanish on the parabolas that
+    a tip leaves.
 
-    An excess of variation down the columns over that along the rows is an offset of whole rows, and vice
-    versa.
+    If the variation down the columns exceeds that along the rows, the excess is an offset of whole rows, and
+    vice versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
@@ -35,10 +36,10 @@ def noise_of(height_um: Array) -> Noise:
 
 
 def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
-    """Highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
+    """Return the highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
 
-    It is exact for a quadratic surface and has the least noise of all linear estimates on the disc. NaN where
-    the disc leaves the scan or contains an unmeasured pixel.
+    The result is exact for a quadratic surface, and has the least noise of all linear estimates on the disc.
+    NaN where the disc leaves the scan or contains an unmeasured pixel.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -61,7 +62,9 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Standard deviation of the curvature of a flat scan with this noise, 1/µm; the larger of both axes."""
+    """Return the standard deviation of the curvature of a flat scan with this noise, 1/µm; the larger of both
+    axes.
+    """
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
         lines = kernel.sum(axis=1 if noise.lines_are_rows else 0)
@@ -72,7 +75,9 @@ def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
 
 @lru_cache(maxsize=64)
 def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
-    """Weights (3, n, n) of the second derivatives xx, xy, yy, 1/µm², of a quadratic fit on a disc."""
+    """Return the weights (3, n, n) of the second derivatives xx, xy, yy, 1/µm², of a quadratic fit on a
+    disc.
+    """
     inside = disc(radius_px)
     y_px, x_px = (places - int(radius_px) for places in np.nonzero(inside))
     y, x = y_px * pitch_um[0], x_px * pitch_um[1]
@@ -84,7 +89,7 @@ def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
 
 
 def disc(radius_px: float) -> Array:
-    """Pixels (n, n) of a disc, bool, n odd."""
+    """Return the pixels (n, n) of a disc, bool, n odd."""
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9

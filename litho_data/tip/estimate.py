@@ -1,4 +1,4 @@
-"""The tip of one or more scans: its radius or an upper bound, and where it did not touch."""
+"""Estimate the tip of one or more scans: its radius or an upper bound, and where it did not touch."""
 
 import math
 from collections.abc import Sequence
@@ -20,9 +20,11 @@ _SAME_PITCH = 1e-3
 
 
 class ScanUnderTip(Record):
-    """One scan: the share of pixels that the tip touched, and the wavelength below which it may show the tip.
+    """One scan: the share of pixels that the tip touched, and the wavelength below which the scan may show
+    the tip.
 
-    Both are None if the image sets no bound on the tip; ``resolution_um`` also if the tip does not limit it.
+    Both are None if the image sets no bound on the tip; ``resolution_um`` is also None if the tip does not
+    limit it.
     """
 
     name: str
@@ -65,11 +67,11 @@ class TipEstimate(RunFacts, Result):
 
 
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
-    """The tip that made one or more scans, such as those of one day.
+    """Estimate the tip that made one or more scans, such as those of one day.
 
     The radius comes from the sharpest tops, because an image is nowhere more sharply curved than the end of
-    its tip. It is an estimate only if many tops share the largest curvature and valleys exceed it; otherwise
-    the tip may be sharper than anything that it scanned.
+    its tip. The radius is an estimate only if many tops share the largest curvature and valleys exceed it.
+    Otherwise the tip may be sharper than anything that it scanned.
 
     Args:
         scans: scans with a pitch, the same for all. Levelling has little influence.

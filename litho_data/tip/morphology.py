@@ -1,4 +1,5 @@
-"""The surface under an image: a tip dilates what it scans, and eroding the image by the tip gives it back.
+"""Find the surface behind an image: a tip dilates what it scans, and eroding the image by the tip restores
+the surface.
 
 Unmeasured pixels (NaN) are ignored.
 """
@@ -11,7 +12,7 @@ from litho_data.foundation.kinds import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A surface (ny, nx), and row and column of the pixel that sets each height, int32; NaN sets none."""
+    """A surface (ny, nx), and row and column (int32) of the pixel that sets each height; NaN sets none."""
 
     surface: Array
     row: Array
@@ -19,7 +20,7 @@ class Eroded(NamedTuple):
 
 
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
-    """The highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
+    """Return the highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
 
     A paraboloid is the sum of two parabolas, so the minimum is taken along one axis after the other. NaN
     stays NaN.
@@ -38,9 +39,11 @@ def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
 def _erode_rows(
     heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
 ) -> tuple[Array, Array]:
-    """Lowest height + distance²/2R along rows, and the position of the pixel that gives it."""
+    """Return the lowest value of height + distance²/2R along rows, and the position of the pixel that gives
+    it.
+    """
     lowest, owner = heights.copy(), places.copy()
-    # Farther away the tip is higher than all of the image.
+    # Farther away the tip is higher than the whole image.
     reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)
     for step in range(1, reach + 1):
         rise = (step * pitch_um) ** 2 / (2 * radius_um)

@@ -1,9 +1,9 @@
-"""The radius of the end of a tip, from the sharpest tops of its images.
+"""Estimate the radius of the end of a tip from the sharpest tops of its images.
 
-Under a paraboloid tip the image plus x²/2R is convex along every line: no top is curved more sharply than
-1/R, and every corner and spike sharper than the tip appears with exactly that curvature. So the distribution
-of an image's curvatures ends in an edge: a clear one if the tip sets it, a thin tail if the surface does.
-Curvatures are measured along the lines of the scan, where offsets of lines do not matter.
+Under a paraboloid tip the image plus x²/2R is convex along every line. No top is curved more sharply than
+1/R, and every corner and spike sharper than the tip appears with exactly this curvature. The distribution of
+an image's curvatures therefore ends in an edge: a clear edge if the tip sets it, a thin tail if the surface
+does. Curvatures are measured along the lines of the scan, where offsets of lines do not matter.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,23 @@ from litho_data.tip.curvature import QUIET, noise_of
 
 # Half sides of the square windows of a parabola, pixels.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# Half sides of a third of the reach average most and still fit on the image of an edge, up to 0.45 of it.
+# Windows with half sides of a third of the reach average most and still fit on the image of an edge; up to
+# 0.45 is allowed.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The edge: 98 % of the curvatures above half of the edge lie below it; there, noise adds 1.4 of its standard
-# deviations.
+# The edge is placed so that 98 % of the curvatures above half of it lie below it; noise adds 1.4 of its
+# standard deviations there.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
 # Near the scanner's turning points, a line says little.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Share of the tops above 0.4 of the edge that exceed 0.8 of it; up to 0.16 on surfaces that no tip limits.
+# Share of the tops above 0.4 of the edge that exceed 0.8 of it; it is up to 0.16 on surfaces that no tip
+# limits.
 _TIP_SHARE = 0.25
-# A tip is the same all over a scan, a surface's few sharpest tops are not. So that share is multiplied by the
-# share of the scan's 5 x 5 parts whose own edge reaches 0.9 of the whole scan's. Of the estimates that are
-# more than 10 % too blunt, most on rounded bumps lie below this limit, but only one in twenty on steep walls
-# and spikes.
+# A tip is the same all over a scan, but the few sharpest tops of a surface are not. This share is therefore
+# multiplied by the share of the scan's 5 x 5 parts whose own edge reaches 0.9 of the whole scan's. Of the
+# estimates that are more than 10 % too blunt, most on rounded bumps lie below this limit, but only one in
+# twenty on steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
 # Under a tip, valleys are sharper than tops; on other surfaces, and in most noise, they are not.
 _SHARPER_VALLEYS = 1.2
@@ -42,10 +44,11 @@ _SPAN = (0.5, 99.5)
 
 @dataclass(frozen=True)
 class PeakRadius:
-    """A radius, µm, None without any bound; ``reason``: why it is only a bound, empty for an estimate.
+    """A radius, µm, or None without any bound; ``reason`` says why it is only a bound, and is empty for an
+    estimate.
 
-    ``sd_um``: standard uncertainty; a bound lies twice that above the value found. ``depth_um``: range of
-    heights; ``window_px``, ``share``: see ``TipEstimate``.
+    ``sd_um`` is the standard uncertainty; a bound lies twice this value above the radius found. ``depth_um``
+    is the range of heights; for ``window_px`` and ``share`` see ``TipEstimate``.
     """
 
     radius_um: float | None
@@ -57,7 +60,8 @@ class PeakRadius:
 
 
 def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
-    """The radius of the tip from one scan, or an upper bound and the reason why it is no more.
+    """Estimate the radius of the tip from one scan, or an upper bound with the reason why no estimate is
+    possible.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured. Tilt and bow count as depth only.
@@ -90,10 +94,10 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 
 
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
-    """The tip that made several scans: the mean of the estimates, or the lowest bound.
+    """Combine several scans of one tip: return the mean of the estimates, or the lowest bound.
 
-    Estimates well above the lowest come from rounded surfaces and are dropped, and a bound from one scan
-    refutes estimates well above it from others.
+    Estimates well above the lowest come from rounded surfaces and are dropped. A bound from one scan refutes
+    estimates well above it from others.
     """
     known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
     estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
@@ -112,7 +116,7 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 
 @dataclass(frozen=True)
 class _Tops:
-    """Curvatures (ny, nx), 1/µm, of windows of one size, positive at tops, NaN where there is no window."""
+    """Curvatures (ny, nx), 1/µm, of windows of one size: positive at tops, NaN without a window."""
 
     half_px: int
     noise: float
@@ -125,7 +129,7 @@ class _Tops:
         return near / max(sharp, 1)
 
     def edges(self, count: int) -> list[float]:
-        """The edge in each of count x count parts of the scan."""
+        """Return the edge in each of count x count parts of the scan."""
         return [
             _edge(part, self.noise)
             for rows in np.array_split(self.curvature, count, axis=0)
@@ -136,7 +140,7 @@ class _Tops:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
     def doubt(self, depth_um: float, pitch_um: YX) -> str:
-        """Why the edge may not come from the tip; empty if there is no doubt."""
+        """Say why the edge may not come from the tip; return an empty text if there is no doubt."""
         reach = self.reach_px(depth_um, pitch_um)
         if reach < _SMALLEST_REACH_PX:
             return f"such a tip reaches over {reach:.1f} pixels, fewer than {_SMALLEST_REACH_PX:.0f}"
@@ -160,7 +164,7 @@ class _Tops:
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     from scipy.signal import savgol_coeffs
 
-    # Weights of the second derivative of the best parabola through a window.
+    # These are the weights of the second derivative of the best parabola through a window.
     weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
@@ -168,7 +172,9 @@ def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops
 
 
 def _along_lines(lines: Array, weights: Array) -> Array:
-    """Second derivative along the lines, averaged over the lines of a window; NaN without a whole window."""
+    """Return the second derivative along the lines, averaged over the lines of a window; NaN without a whole
+    window.
+    """
     from scipy.ndimage import correlate1d, uniform_filter1d
 
     size, half = len(weights), len(weights) // 2
@@ -183,7 +189,7 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Where the curvatures end, minus what noise adds; 0 or less if there is only noise."""
+    """Return where the curvatures end, minus what noise adds; 0 or less if there is only noise."""
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:
         return 0.0

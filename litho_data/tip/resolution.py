@@ -1,4 +1,4 @@
-"""The lateral resolution to which a tip limits a scan."""
+"""Compute the lateral resolution to which a tip limits a scan."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ _SHARE = 0.5
 
 
 def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
-    """Wavelength below which the scan may show the tip instead of the surface, µm.
+    """Return the wavelength below which the scan may show the tip instead of the surface, µm.
 
     Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is taken at distance
-    λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes; the result is the largest λ at
-    which it reaches half of 1/R: Sanner et al., Scale-dependent roughness parameters for topography analysis,
-    arXiv:2106.16103. Noise counts as peaks: the result is an upper bound.
+    λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result is the largest λ at
+    which this curvature reaches half of 1/R: Sanner et al., Scale-dependent roughness parameters for
+    topography analysis, arXiv:2106.16103. Noise counts as peaks, so the result is an upper bound.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured.

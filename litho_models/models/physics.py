@@ -80,8 +80,8 @@ class Physics(Simulator):
 
     In ``default`` H₀ is the nominal full height and g a gain; without it a full level would always print H₀ +
     b. In ``paper`` and ``authors`` H₀ is 1 µm and g is 1. With a threshold below 0, before the first level,
-    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, where u is the diffused dose on
-    0 ... 1. Its range is fixed to 0 ... 1 in ``default``, and is the range of the image in ``paper`` or its
+    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, where u is the diffused dose
+    scaled to 0 ... 1: from a fixed range in ``default``, from the range of the image in ``paper``, from its
     maximum in ``authors``. In ``paper`` and ``authors`` the result therefore depends on the crop.
     """
 

@@ -159,7 +159,7 @@ class TestStepHeight:
         assert 0.85 < np.std(errors) < 1.3
 
     def test_bad_edges_are_an_error(self):
-        with pytest.raises(InputError, match="one width to spare"):
+        with pytest.raises(InputError, match="one width free on both sides"):
             groove_depth(np.zeros((4, 100)), PITCH_UM, left_um=1, right_um=6)
         with pytest.raises(InputError, match="ascending"):
             stair_steps(np.zeros((4, 100)), PITCH_UM, edges_um=[5, 4])

@@ -86,5 +86,5 @@ def test_what_is_no_scan_is_refused(arguments: dict, message: str) -> None:
 def test_a_missing_pitch_is_an_error_where_lengths_are_needed() -> None:
     scan = Scan(height_um=HEIGHT_UM, pitch_um=None, name="FOV11")
     for needs_lengths in (scan.require_pitch, lambda: scan.grid):
-        with pytest.raises(InputError, match=r"FOV11 carries no pixel pitch.*size_um"):
+        with pytest.raises(InputError, match=r"FOV11 has no pixel pitch.*size_um"):
             needs_lengths()
