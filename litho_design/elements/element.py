@@ -175,7 +175,9 @@ class Element(nn.Module):
         size = self.layout.size_px
         if tuple(values.shape[-2:]) != (size, size):
             got = f"shape {tuple(values.shape)}"
-            raise InputError(f"{what} of an element", got=got, wanted=f"(..., {size}, {size}), its pixels")
+            raise InputError(
+                f"{what} of an element", got=got, wanted=f"(..., {size}, {size}), the pixels of the element"
+            )
 
     def _check(self) -> None:
         if self.printer.only_judges:

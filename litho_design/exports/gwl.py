@@ -90,7 +90,7 @@ def _powers(job: Gwl, highest: int) -> tuple[float, ...]:
         raise InputError(
             "laser power",
             got=f"{len(powers)} numbers",
-            wanted=f"one, or one for the pedestal and {highest} levels",
+            wanted=f"one number, or one for the pedestal and each of {highest} levels",
         )
     return powers
 

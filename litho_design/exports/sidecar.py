@@ -117,6 +117,6 @@ def read_sidecar(file: Path) -> Sidecar:
     sidecar = Sidecar.read(sidecar_path(file))
     if file_sha256(file) != sidecar.file_sha256:
         raise InputError(
-            f"file {file}", got="other bytes than those exported", wanted=sidecar.file_sha256[:12]
+            f"file {file}", got="content that changed after the export", wanted=sidecar.file_sha256[:12]
         )
     return sidecar

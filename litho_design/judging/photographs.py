@@ -86,7 +86,10 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     assert loaded.target is not None
     if source.imaged is not None:
         raise InputError(
-            "photographed object", got="the design of a hologram", wanted="a lens", hint="no --camera-object"
+            "photographed object",
+            got="the design of a hologram",
+            wanted="the design of a lens",
+            hint="no --camera-object",
         )
     power = source.power_counts
     if power is not None and not power > 0:

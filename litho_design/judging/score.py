@@ -144,7 +144,9 @@ def judge_design(
         of_lens = isinstance(loaded.task, LensTask)
         if loaded.target is None and not of_lens:
             raise InputError(
-                "photograph", got=f"a design of {loaded.task.name!r}", wanted="a hologram or a lens"
+                "photograph",
+                got=f"a design of {loaded.task.name!r}",
+                wanted="the design of a hologram or a lens",
             )
         photo = (
             score_lens_photo(loaded, camera, printed_um) if of_lens else score_hologram_photo(loaded, camera)

@@ -79,7 +79,10 @@ def load_printers(
         printer = load_printer(source, layout, name=name, **fit)
         if printer.name in printers:
             raise InputError(
-                "models", got=f"{printer.name!r} twice", wanted="one name each", hint="use NAME=MODEL"
+                "models",
+                got=f"{printer.name!r} twice",
+                wanted="a different name for each",
+                hint="use NAME=MODEL",
             )
         printers[printer.name] = printer
     return printers

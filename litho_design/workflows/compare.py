@@ -101,7 +101,7 @@ def compare(
     elif isinstance(settings, HologramSettings):
         if objects or held_out_objects:
             raise InputError(
-                "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
+                "objects", got="the hoe task, which has a target", wanted="the lens task", hint="--target"
             )
         wanted = load_target(target, settings.layout.size_px)
         make = partial(HologramTask, inputs={"target": wanted.pixels}, record=wanted.record)

@@ -59,7 +59,9 @@ def score(
             given = "a scan, a photograph, another element or a design in memory"
             raise InputError("score of a large element", got=given, wanted="models that score it")
         if record.in_rings and band_px is not None:
-            raise InputError("score of a lens in rings", got="bands", wanted="none: rings need no plane")
+            raise InputError(
+                "score of a lens in rings", got="bands", wanted="no bands, because rings need no plane"
+            )
         judges = judges or ()
     loaded = (
         design

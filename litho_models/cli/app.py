@@ -320,7 +320,9 @@ def _attribution(given: Sequence[str]) -> Any:
         return given[0]
     if wrong := [text for text in given if "=" not in text]:
         raise InputError(
-            "--attribute", got=wrong[0], wanted="EFFECT=microscope or EFFECT=printer, where several"
+            "--attribute",
+            got=wrong[0],
+            wanted="EFFECT=microscope or EFFECT=printer for each, if there are several",
         )
     return dict(text.split("=", 1) for text in given)
 

@@ -53,7 +53,9 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         model = Pbl(Pbl.Config.of_variant("authors", **fields))
         state = _pbl_state(own)
     else:
-        raise InputError("weights", got=", ".join(own) or "none", wanted="those of a class of the authors")
+        raise InputError(
+            "weights", got=", ".join(own) or "none", wanted="the weights of one of the authors' classes"
+        )
     wanted = model.state_dict()
     wrong = sorted(
         name

@@ -67,7 +67,7 @@ def cross_fit(
     height, prediction = np.asarray(height_um, np.float64), np.asarray(prediction_um, np.float64)
     if not height.shape == prediction.shape == valid.shape:
         shapes = f"height {height.shape}, prediction {prediction.shape}, valid {valid.shape}"
-        raise InputError("shapes of one scan differ", got=shapes, wanted="one (ny, nx)")
+        raise InputError("shapes of one scan differ", got=shapes, wanted="the same (ny, nx) for all")
     if scan_line is not None and (scan_line.shape != height.shape or scan_line.min() < 0):
         wanted = f"indices from 0, shape {height.shape}"
         raise InputError("scan_line", got=f"shape {scan_line.shape}", wanted=wanted)

@@ -136,7 +136,7 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
     if term.name in SCAN_TERMS:
         raise InputError("scan term", got=f"{term.name}, which exists", wanted="a new name")
     if (term.maps is None) == (term.lines is None):
-        raise InputError(f"scan term {term.name}", got="maps and lines", wanted="one of the two")
+        raise InputError(f"scan term {term.name}", got="both maps and lines", wanted="either maps or lines")
     SCAN_TERMS[term.name] = term
     return term
 
