@@ -1,1 +1,1 @@
-"""Build a dataset from a card: operations, jobs and the finished store."""
+"""Build a dataset from a card: run operations and jobs, and finish the store."""

@@ -28,10 +28,10 @@ IMAGES = "o"
 
 @dataclass(frozen=True)
 class Source:
-    """Everything that a store is made from, with the raw files by id for the manifest.
+    """Everything from which a store is made, with the raw files by id for the manifest.
 
-    ``files`` maps each id to its raw files by recorded name, ``standards`` holds the raw files of the
-    calibration; ``unpaired`` and ``refused`` map ids to reasons.
+    ``files`` maps each id to its raw files by recorded name, and ``standards`` contains the raw files of the
+    calibration. ``unpaired`` and ``refused`` map ids to reasons.
     """
 
     card: Card
@@ -54,7 +54,7 @@ def assemble(
     skipped: Mapping[str, str],
     build: Record,
 ) -> str:
-    """Write everything except the groups ``scans/<id>``, which exist; returns the dataset's hash.
+    """Write everything except the groups ``scans/<id>``, which already exist; return the dataset's hash.
 
     Args:
         root: the growing group.
@@ -85,20 +85,20 @@ def assemble(
 
 
 def records_of_use(records: Sequence[Record]) -> list[Record]:
-    """The records of the dataset's own scans, references left out, in order."""
+    """Return the records of the dataset's own scans in order, without references."""
     return [record for record in records if record["use"] == "dataset"]
 
 
 def facts_of_card(card: Card) -> dict[str, Any]:
-    """What a card says about all scans, as part of the dataset's hash."""
+    """Return what a card says about all scans, as part of the dataset's hash."""
     write = card.write.model_dump(exclude_none=True) if card.write else None
     return dataset_facts(card.layout, card.scan.instrument, write)
 
 
 def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """The attributes of the root group; all but the two hashes follow from the manifest.
+    """Return the attributes of the root group; all but the two hashes follow from the manifest.
 
-    They are numbers and words only, which any format can hold.
+    The attributes are only numbers and words, which any format can store.
     """
     card = Card.model_validate(manifest["card"])
     facts = facts_of_card(card)
@@ -124,7 +124,9 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
 
 
 def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.DataFrame) -> dict[str, Any]:
-    """The manifest without its table of files: the card as it was understood, and hashes of the tables."""
+    """Return the manifest without its table of files: the card as it was understood, and hashes of the
+    tables.
+    """
     content = {
         "card": source.card.model_dump(mode="json", exclude_none=True),
         "recipe": dict(source.recipe),
@@ -137,7 +139,7 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Record]) -> pd.DataFrame:
-    """One row per scan of the dataset; a figure that could not be computed is NaN."""
+    """Return one row per scan of the dataset; a figure that could not be computed is NaN."""
     import pandas as pd
 
     rows = []
@@ -152,7 +154,7 @@ def quality_table(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
-    """One row per step of every scan: the record as JSON, its id, and the software that ran it."""
+    """Return one row per step of every scan: the record as JSON, its id, and the software that ran it."""
     import pandas as pd
 
     rows = [
@@ -170,7 +172,9 @@ def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def table_sha256(table: pd.DataFrame) -> str:
-    """Hash of a table: column names and values, in order, except for the software column, which varies."""
+    """Return the hash of a table: column names and values, in order, without the software column, which
+    varies.
+    """
     columns = {}
     for name in sorted(str(column) for column in table.columns if column != "software"):
         values = table[name].to_numpy()
@@ -200,7 +204,7 @@ def _shape_of(record: Record, *names: str) -> tuple[int, int]:
 
 
 def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[str, str]) -> pd.DataFrame:
-    """One row per raw file, sorted by id.
+    """Return one row per raw file, sorted by id.
 
     Args:
         source: the files by id and recorded name, and which have no partner.
@@ -247,7 +251,7 @@ def _used_sha256(record: Mapping[str, Any], name: str) -> str:
 
 
 def _facts(record: Mapping[str, Any] | None, name: str) -> dict[str, Any]:
-    """Facts about a scan file from its reader; none for a layout."""
+    """Return what the reader says about a scan file; nothing for a layout."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

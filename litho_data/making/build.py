@@ -1,4 +1,4 @@
-"""``build_dataset``: make a dataset store and a report from raw files and a card."""
+"""Make a dataset store and a report from raw files and a card (``build_dataset``)."""
 
 import functools
 import os
@@ -29,7 +29,7 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# If the pixel aspect differs more than this from that of other scans, rows or columns are missing.
+# If the pixel aspect differs by more than this from that of other scans, rows or columns are missing.
 _ASPECT_TOLERANCE = 1e-3
 _MOST_SEARCHES = 2000
 
@@ -47,9 +47,9 @@ def build_dataset(
 ) -> BuildResult:
     """Build a dataset store from a card.
 
-    Each scan is read, levelled by the card's recipe, registered and resampled once onto its layout's grid.
-    A scan that cannot be used is skipped, with a line on stderr and a reason in the manifest. The store
-    appears whole or not at all; an interrupted build resumes. The report goes to ``<name>-report`` beside the
+    Each scan is read, levelled by the card's recipe, registered and resampled once onto its layout's grid. A
+    scan that cannot be used is skipped, with a line on stderr and a reason in the manifest. The store appears
+    completely or not at all; an interrupted build resumes. The report goes to ``<name>-report`` beside the
     store.
 
     Args:
@@ -87,7 +87,7 @@ def _recipe(listing: Listing) -> dict[str, Any]:
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
     standards = standards_of(listing)
     if standards.described:
-        # A bad standard spoils every scan, so it is reported once, before any scan is made.
+        # A bad standard spoils every scan, so it is reported once, before any scan is processed.
         measure_scales(standards.described, list(standards.files.values()))
     found = {one.id: [one.layout, one.scan] for one in listing.fields}
     found |= {one.id: [*one.files] for one in listing.left_aside}
@@ -106,7 +106,7 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequen
 
 
 def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
-    """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
+    """Run the jobs of a source and put the store and its report in their places; see ``build_dataset``."""
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
         root = partial.open()
@@ -123,13 +123,14 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             what = f"building {source.card.name}"
             for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
                 if isinstance(outcome, Skipped):
-                    # Names as recorded, because the manifest must not depend on where the raw files lie.
+                    # Names are written as recorded, because the manifest must not depend on where the raw
+                    # files are.
                     skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
                     _report_skipped(outcome.id, skipped[outcome.id])
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
-            # An error of the cluster: finished scans stay for the next run.
+            # This is an error of the cluster: finished scans are kept for the next run.
             if not records:
                 partial.discard()
             raise
@@ -183,7 +184,7 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
 
 
 def _relative(folder: Path, start: Path) -> str:
-    """Path of the raw files from the store's folder, so that both can move together."""
+    """Return the path of the raw files relative to the store's folder, so that both can be moved together."""
     try:
         return Path(os.path.relpath(folder, start)).as_posix()
     except ValueError:  # another drive
@@ -196,7 +197,7 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    # A layout may be printed, and a print scanned, more than once; the layout is named by its first id.
+    # A layout may be printed, and a print scanned, more than once; the layout gets the name of its first id.
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
     # One search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
@@ -214,7 +215,8 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
-    """Scans whose pixels have another aspect than most, if the size comes from the card, not from the file.
+    """Find scans whose pixel aspect differs from that of most, if the size comes from the card, not from the
+    file.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
     """

@@ -1,4 +1,4 @@
-"""The scales of a microscope from the card's scans of gratings and of a step."""
+"""Find the scales of a microscope from the card's scans of gratings and of a step."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,12 +17,13 @@ from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
 SCALES = ("y", "x", "z")
-# If a measured height is further from the known one, a unit or a file is wrong.
+# If a measured height is further from the known height than this factor, a unit or a file is wrong.
 _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """The scales that a build of the card would apply: those of ``y``, ``x`` and ``z`` that it calibrates.
+    """Return the scales that a build of the card would apply: those of ``y``, ``x`` and ``z`` that it
+    calibrates.
 
     Raises:
         InputError: a card without ``[calibration]``, a missing file, or a scan that shows no grating or step.
@@ -52,7 +53,7 @@ class Standards:
 
     @property
     def scales(self) -> set[str]:
-        """Which scales have a standard."""
+        """Return the names of the scales that have a standard."""
         return {one["scale"] for one in self.described}
 
 
@@ -60,7 +61,7 @@ NO_STANDARDS = Standards()
 
 
 def standards_of(listing: Listing) -> Standards:
-    """The standards of a card.
+    """Return the standards of a card.
 
     Raises:
         InputError: a file that is missing, or a link that leads out of the data folder.
@@ -98,12 +99,13 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> Array:
-    """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 without a standard.
+    """Measure factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 without a
+    standard.
 
     Raises:
         InputError: a scan that shows no grating or step of about the known size.
     """
-    # Cached, because every scan of a build asks for them.
+    # The result is cached, because every scan of a build asks for it.
     times = tuple(file.stat().st_mtime_ns for file in files)
     return _measured(json.dumps(list(standards)), tuple(files), times).copy()
 

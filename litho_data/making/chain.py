@@ -1,4 +1,4 @@
-"""Run the operations on one scan in turn, and collect the piece of the store that they make."""
+"""Run the operations on one scan in turn, and collect the part of the store that they make."""
 
 import json
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from litho_data.store.partial import Piece
 
 @dataclass
 class Chain:
-    """Results of the operations so far: recorded steps, arrays by name, facts by operation."""
+    """The results of the operations so far: recorded steps, arrays by name, facts by operation."""
 
     steps: list[Step] = field(default_factory=list)
     arrays: dict[str, Array] = field(default_factory=dict)
     facts: dict[str, Facts] = field(default_factory=dict)
 
     def run(self, op: str, params: Mapping[str, Any], files: Mapping[str, Path] | None = None) -> Facts:
-        """Run an operation on these files and on earlier arrays; InputError if that is impossible."""
+        """Run an operation on these files and on earlier arrays; raise InputError if that is impossible."""
         step, arrays, self.facts[op] = OPERATIONS[op].run(params, files or {}, self.arrays)
         self.steps.append(step)
         self.arrays |= arrays
@@ -30,22 +30,22 @@ class Chain:
 
     @property
     def read(self) -> Facts:
-        """Facts about the scan from its reader."""
+        """Return what the reader says about the scan."""
         return next(self.facts[op] for op in READERS if op in self.facts)
 
     @property
     def scales(self) -> Facts:
-        """The scales of the microscope; empty without standards."""
+        """Return the scales of the microscope; empty without standards."""
         return self.facts.get("calibrate", {})
 
     @property
     def pitch_um(self) -> list[float]:
-        """The stated (y, x) pitch of the scan times the scales of its axes, if they are known."""
+        """Return the stated (y, x) pitch of the scan times the scales of its axes, if they are known."""
         axes = zip("yx", self.read["pitch_um"], strict=True)
         return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
 
     def piece(self, **said: Any) -> Piece:
-        """The piece of the store that these steps made, with further facts for its record."""
+        """Return the part of the store that these steps made, with further facts for its record."""
         steps = [step.to_record() for step in self.steps]
         record = {**said, "steps": steps, "software": software_record()}
         return Piece(json.loads(json.dumps(record)), self.arrays)

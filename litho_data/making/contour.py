@@ -1,8 +1,8 @@
-"""Find the edges of a film in an electron micrograph, as signed distances, and convert them to heights.
+"""Find the edges of a film in an electron micrograph as signed distances, and convert them to heights.
 
 The film is bright, its rim is brightest, and charging distorts both. The edge is placed half way between the
-brightness of the ground and that of the rim in its neighbourhood. Which point on the flank of the rim is the
-edge of the film's wall is a convention that a micrograph cannot check.
+local brightness of the ground and that of the rim. Which point on the flank of the rim is the edge of the
+film's wall is a convention that a micrograph cannot check.
 """
 
 from typing import NamedTuple
@@ -15,21 +15,22 @@ from litho_data.foundation.kinds import Array
 REACH_PX = 8.0
 """Distances are clipped to this many pixels of the micrograph."""
 _NOISE_PX = 1.0
-# Distances from the first edge, px, that count as rim and as ground; sigma of their local means.
+# Distances from the first edge, px, that count as rim and as ground, and the sigma of their local means.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
-# Largest distance from the first edge, which comes from one threshold for the whole picture.
+# Largest distance from the first edge; this edge comes from one threshold for the whole picture.
 _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# A part of the layout counts as lost if no larger share of it was printed.
+# A part of the layout counts as lost if at most this share of it was printed.
 _LOST = 0.1
 
 
 class Edges(NamedTuple):
-    """``distance_px`` (ny, nx) from the nearest edge, positive on the film; ``sigma_px``: its sd at a pixel.
+    """``distance_px`` (ny, nx) is the distance from the nearest edge, positive on the film; ``sigma_px`` is
+    its sd at a pixel.
 
-    ``specks``: bool (ny, nx), dots and pinholes of at most 40 px, which are ignored.
+    ``specks``, bool (ny, nx), marks dots and pinholes of at most 40 px, which are ignored.
     """
 
     distance_px: Array
@@ -38,7 +39,7 @@ class Edges(NamedTuple):
 
 
 def find_edges(grey: Array) -> Edges:
-    """Edges of the film in a micrograph (ny, nx), to a fraction of a pixel.
+    """Find the edges of the film in a micrograph (ny, nx), to a fraction of a pixel.
 
     Raises:
         InputError: a picture without edges.
@@ -50,7 +51,7 @@ def find_edges(grey: Array) -> Edges:
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
-    # A threshold on logarithms, so that bright rims and charging count for less.
+    # The threshold is on logarithms, so that bright rims and charging count for less.
     logarithm = np.log(smooth + _DARKEST)
     first = logarithm > threshold_otsu(logarithm)
     film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)
@@ -80,21 +81,23 @@ def find_edges(grey: Array) -> Edges:
 
 
 def _dense(line: Array) -> Array:
-    """Points along a contour (n, 2), evenly spaced."""
+    """Return evenly spaced points along a contour (n, 2)."""
     along = np.r_[0.0, np.hypot(*np.diff(line, axis=0).T).cumsum()]
     places = np.arange(0.0, along[-1], _STEP_PX)
     return np.stack([np.interp(places, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def coverage(distance_um: Array, pitch_um: float) -> Array:
-    """Share of each pixel that film covers, 0 to 1, from the signed distance of its centre from an edge."""
+    """Return the share of each pixel that film covers, 0 to 1, from the signed distance of its centre from an
+    edge.
+    """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
     """Find defects in a micrograph: film deep in a gap of the layout, or a pit in the film.
 
-    A gap that is closed entirely, or an island that is lost entirely, counts as print.
+    A gap that is completely closed, or an island that is completely lost, counts as print.
 
     Args:
         covered: coverage (ny, nx), NaN where not seen; ``layout_share``: coverage by the layout.

@@ -11,9 +11,10 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """The jobs with the radius in place of ``blind``, or without a tip if the scans set no bound on it.
+    """Return the jobs with the radius in place of ``blind``, or without a tip if the scans set no bound on
+    it.
 
-    It prints the result on stderr. Scans that cannot be read are left out; their jobs report why.
+    The result is also printed on stderr. Scans that cannot be read are left out; their jobs report why.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)
@@ -27,7 +28,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:
         print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
-    # Rounded far below its uncertainty, so that the order in which scans finish does not matter.
+    # The radius is rounded far below its uncertainty, so that the order in which scans finish does not
+    # matter.
     rounded = None if radius_um is None else float(f"{radius_um:.9g}")
     card = jobs[0].card
     process = card.process.model_copy(update={"tip": rounded})
@@ -35,7 +37,9 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """Estimate of the tip from one scan, in calibrated lengths if there are standards; None if unreadable."""
+    """Estimate the tip from one scan, in calibrated lengths if there are standards; return None if
+    unreadable.
+    """
     try:
         chain = job.begin()
     except InputError:

@@ -1,4 +1,4 @@
-"""Measure scales, unevenness and tip of a microscope on scans of a grating of known size."""
+"""Measure scales, unevenness and tip of a microscope in scans of a grating of known size."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """One scan of a grating; figures that it does not show are None, and ``problem`` says why.
+    """One scan of a grating; figures that the scan does not show are None, and ``problem`` says why.
 
     Args:
         scale_x, scale_y: factors for stated lengths; ``_sd``: their standard uncertainties.
@@ -38,7 +38,7 @@ class GratingScan(Record):
 
 
 def grating_scans(store: Store) -> list[GratingScan]:
-    """The gratings among a store's references with fast axis x, measured in the scans as they were read."""
+    """Measure the gratings among a store's references with fast axis x, in the scans as they were read."""
     known = store.manifest.get("card", {}).get("grating")
     if known is None:
         return []

@@ -1,4 +1,5 @@
-"""One unit of work of a build, from a field's files to a finished piece or a reason for skipping it.
+"""One unit of work of a build: from a field's files to a finished part of the store, or a reason for skipping
+the field.
 
 Jobs are sent to other processes and machines, so they contain only paths and plain parameters.
 """
@@ -21,7 +22,7 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Rim of level 0 around a field that is alone on the substrate, as models extend the edge of a layout.
+# Rim of level 0 around a field that is alone on the substrate, because models extend the edge of a layout.
 _BARE_PX = 2
 # Film this deep (px) in a gap of the layout is dirt, and ground this deep in its film is a pit.
 _DIRT_PX = 5
@@ -32,13 +33,13 @@ class Job(Protocol):
 
     @property
     def id(self) -> str:
-        """Id of the scan."""
+        """Return the id of the scan."""
 
     def key(self) -> str:
-        """Hash of everything that determines the piece: files, parameters, code."""
+        """Return the hash of everything that determines the result: files, parameters, code."""
 
     def run(self) -> Piece:
-        """Make the piece; InputError if the files do not allow it."""
+        """Make this part of the store; raise InputError if the files do not allow it."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Skipped:
 
 
 def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
-    """Run a job, keep its piece and return the record of the piece; arrays stay where they are made.
+    """Run a job, store its result and return the record; arrays stay where they are made.
 
     Bad input becomes a reason for skipping, so one bad file never stops a build.
     """
@@ -79,11 +80,11 @@ class FieldJob:
 
     @property
     def id(self) -> str:
-        """Id of the scan."""
+        """Return the id of the scan."""
         return self.field.id
 
     def key(self) -> str:
-        """Hash of everything that determines the piece."""
+        """Return the hash of everything that determines the result."""
         described = {**asdict(self.field), "scan": self.scan_name, "layout": self.layout_name}
         plan = [described, self.recipe, self.seed, self.card.model_dump(mode="json")]
         own = (self.field.scan, self.field.layout, *self.standards.files.values())
@@ -92,7 +93,7 @@ class FieldJob:
         return record_sha256([*plan, files, code])
 
     def layout(self) -> Array | None:
-        """Levels of its layout; None if it has no layout that can be read."""
+        """Return the levels of the layout; None if the field has no layout that can be read."""
         chain = Chain()
         try:
             self._read_layout(chain)
@@ -101,7 +102,7 @@ class FieldJob:
         return chain.arrays.get("mask_level")
 
     def begin(self) -> Chain:
-        """Read layout, scan and scales; InputError if one of them is unusable."""
+        """Read layout, scan and scales; raise InputError if one of them is unusable."""
         chain = Chain()
         self._read_layout(chain)
         file = {self.scan_name: self.field.scan}
@@ -115,14 +116,14 @@ class FieldJob:
         return chain
 
     def register_params(self, chain: Chain) -> dict[str, Any]:
-        """Parameters of a registration of the scan that was read."""
+        """Return the parameters for the registration of the scan that was read."""
         pitches = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
-        # If unknown, the lines are taken as rows.
+        # If the fast axis is unknown, the lines are taken as rows.
         lines = {"fast_axis": "y"} if chain.read["fast_axis"] == "y" else {}
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 
     def run(self) -> Piece:
-        """Make the finished scan; InputError if its files do not allow it."""
+        """Make the finished scan; raise InputError if its files do not allow it."""
         chain = self.begin()
         (self._cover if self._is_micrograph else self._level)(chain)
         arrays, facts = chain.arrays, chain.facts
@@ -167,7 +168,7 @@ class FieldJob:
         pitch = {"scan_pitch_um": chain.pitch_um}
         recipe = dict(self.recipe)
         if "mask_level" not in chain.arrays or not (of_dataset or np.ptp(chain.arrays["mask_level"])):
-            # A reference has no layout, or a flat one that cannot be located.
+            # A reference has no layout, or a flat layout that cannot be located.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             chain.run("locate", self.register_params(chain))
@@ -183,7 +184,7 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """The layout's grid, and the number of its outermost pixels to ignore.
+        """Return the layout's grid, and the number of its outermost pixels to ignore.
 
         The height of these pixels depends on the unknown surroundings of the field.
         """
@@ -218,13 +219,13 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        # Facts from the table must agree with the file; those from the card are only defaults.
+        # Facts from the table must agree with the file; facts from the card are only defaults.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 
 
 def field_jobs(listing: Listing, recipe: Mapping[str, Any], seed: int = 0) -> list[FieldJob]:
-    """The jobs of a card, in the order of its ids."""
+    """Return the jobs of a card, in the order of its ids."""
     standards = standards_of(listing)
     return [
         FieldJob(

@@ -1,6 +1,6 @@
-"""The operations that turn raw files into a dataset, as pure functions of recorded parameters and inputs.
+"""The operations that turn raw files into a dataset: pure functions of recorded parameters and inputs.
 
-A build runs them, ``replay`` runs them again from the record; nothing else makes a stored array.
+A build runs them, and ``replay`` runs them again from the record; nothing else makes a stored array.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# Beyond this pixel aspect, the message of a failed registration asks whether rows are missing.
+# If the pixel aspect exceeds this, the message of a failed registration asks whether rows are missing.
 _OBLONG = 0.01
 
 
@@ -43,14 +43,16 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """A levelling recipe in canonical form; without a file, the recipe that cannot ruin a print."""
+    """Read a levelling recipe in canonical form; without a file, return the recipe that cannot ruin a
+    print.
+    """
     from litho_data.level import Recipe
 
     return (Recipe.from_dict(_PLANE) if path is None else Recipe.from_toml(path)).canonical()
 
 
 def no_recipe() -> dict[str, Any]:
-    """The empty recipe, which leaves heights as they are."""
+    """Return the empty recipe, which leaves heights as they are."""
     from litho_data.level import Recipe
 
     return Recipe().canonical()
@@ -103,7 +105,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Edges of the film, as the height map that will be registered."""
+    """Find the edges of the film, as the height map that will be registered."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -117,7 +119,9 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
-    """The film on the layout's grid without dirt: its height times the share of each pixel that it covers."""
+    """Compute the film on the layout's grid without dirt: its height times the share of each pixel that it
+    covers.
+    """
     from litho_data.making.contour import coverage, foreign
     from litho_data.register.refine import interior_of
 
@@ -138,7 +142,7 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("calibrate", "", "readers", "roughness", "making/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
-    """Scales of the microscope, from scans of standards of known size."""
+    """Measure the scales of the microscope in scans of standards of known size."""
     from litho_data.making.calibration import SCALES, measure_scales
 
     found = measure_scales(params["standards"], files)
@@ -149,7 +153,7 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
 
 
 def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
-    """Factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
+    """Return the factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
     if "calibration" not in arrays:
         return 1.0, 0.0
     factor, uncertainty = arrays["calibration"][2].tolist()
@@ -158,7 +162,7 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 
 @_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Where the layout lies in the scan before levelling, for layout-aware levelling."""
+    """Find where the layout lies in the scan before levelling, for layout-aware levelling."""
     from litho_data.level import layout_in_scan_frame
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
@@ -251,7 +255,7 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _on_layout(scan_map: Array, params: Params, arrays: Inputs) -> tuple[Array, Array]:
-    """A map from the scan's frame at the layout's pixels, and where it is known."""
+    """Resample a map from the scan's frame to the layout's pixels; also return where the map is known."""
     from litho_data.register import Bend, resample_to_layout
 
     pitch_um = tuple(params["scan_pitch_um"])

@@ -1,4 +1,4 @@
-"""The report of a build: inputs, results, and pictures of every scan."""
+"""Write the report of a build: inputs, results, and pictures of every scan."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(enco
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
-    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; returns the page's path."""
+    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; return the page's path."""
     store = open_store(store_path)
     page = Page(
         f"Dataset {store.name}",
@@ -98,7 +98,7 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
     if len(shown.columns) == 1:
-        # Pairs that come without their scans: nothing but names is known.
+        # For pairs that come without their scans, only names are known.
         return
     page.heading("Quality of every scan, in numbers", folded=True)
     page.table(
@@ -154,14 +154,14 @@ def _shown_ids(store: Store) -> list[str]:
 
 
 def _stages(store: Store, scan_id: str) -> list[Array]:
-    """Thumbnails of a scan, in the order of ``_STAGES``."""
+    """Return the thumbnails of a scan, in the order of ``_STAGES``."""
     scan = store.scan(scan_id)
     images = [scan.mask_level, _raw(store, scan_id), scan.height_um * 1e3, _residual_nm(scan)]
     return [thumbnail(image) for image in images]
 
 
 def _raw(store: Store, scan_id: str) -> Array:
-    """Heights in nm, or the grey values of a micrograph."""
+    """Return heights in nm, or the grey values of a micrograph."""
     if store.instrument == "sem":
         return store.scan_frame(scan_id, "micrograph").astype(float)
     return store.scan_frame(scan_id, "raw_height_um") * 1e3

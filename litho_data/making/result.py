@@ -1,4 +1,4 @@
-"""``build.json``: the record of a build."""
+"""The record of a build, ``build.json``."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +16,7 @@ class LeftOut(Record):
 
 
 class BuildResult(Result):
-    """Scans that a build made or left out; ``reused`` scans were finished by an earlier build.
+    """The scans that a build made or left out; an earlier build finished the ``reused`` scans.
 
     ``findings``: things to fix, worst first.
     """
@@ -38,5 +38,5 @@ class BuildResult(Result):
 
 
 def report_folder(out: str | Path) -> Path:
-    """Folder of a store's report: ``<name>-report`` beside the store."""
+    """Return the folder of a store's report: ``<name>-report`` beside the store."""
     return Path(out).parent / f"{Path(out).stem}-report"

@@ -20,14 +20,14 @@ from litho_data.register.topography import predicted_topography, remove_bow
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
-# Number of outermost pixels that are affected by what lies around a field.
+# Number of outermost pixels that the surroundings of a field affect.
 _EDGE_PX = 2
-# Another layout must explain a scan this much better, in correlation.
+# Another layout must explain a scan better by this much, in correlation.
 _BETTER = 0.02
-# A print of another layout reaches 0.3 to 0.5 at its best shift, one of this layout 0.9.
+# With another layout a print reaches 0.3 to 0.5 at the best shift, with its own layout 0.9.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
-# Scatter of the log gain at one dose among prints of one layout, and among those of different layouts.
+# Scatter of the log gain at one dose among prints of one layout, and among prints of different layouts.
 _SCATTER_SAME, _SCATTER_OTHER = 0.01, 0.03
 _CLEAR_SIGMA = 4.0
 
@@ -36,9 +36,9 @@ _CLEAR_SIGMA = 4.0
 class Print:
     """One registered scan: its heights and its blurred layout at a few points, its orientation and its group.
 
-    ``turned``: whether the card says that the print lay turned. Scans of one ``group`` should share a gain:
-    it is the dose, if the card gives it, or the printed block. ``response`` and ``edge_times`` come from
-    ``_response`` and ``_edge_times``.
+    ``turned`` says whether the print lay turned, according to the card. Scans of one ``group`` should share a
+    gain. The group is the dose, if the card gives it, or the printed block. ``response`` and ``edge_times``
+    come from ``_response`` and ``_edge_times``.
     """
 
     id: str
@@ -56,7 +56,7 @@ class Print:
 def prints_of(
     records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, Array]]
 ) -> list[Print]:
-    """The registered scans among the records, at a few points.
+    """Sample the registered scans among the records at a few points.
 
     Args:
         records: records of the scans of a dataset.
@@ -66,7 +66,7 @@ def prints_of(
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Signs that scans do not show their own layout, by id; empty for most sets."""
+    """Return signs that scans do not show their own layout, by id; empty for most sets."""
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -79,7 +79,7 @@ def fitting_layout(
     layouts: Mapping[str, Array],
     pitch_um: float,
 ) -> str:
-    """The layout whose topography a scan shows, in any orientation, or "" if none stands out.
+    """Find the layout whose topography a scan shows, in any orientation; return "" if none stands out.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -106,7 +106,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
     response = _response(topography, height)
     return Print(
         id=record["id"],
-        # Copies, because views would keep the whole arrays in memory.
+        # These are copies, because views would keep the whole arrays in memory.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
         response=response,
@@ -120,10 +120,12 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Scans that another layout of the set explains better, under the warp onto their own layout."""
+    """Yield the scans that another layout of the set explains better, under the warp onto their own
+    layout.
+    """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
-        # A layout that was printed more than once is named by its first id.
+        # A layout that was printed more than once gets the name of its first id.
         distinct = list({one.layout: one for one in reversed(alike)}.values())
         layouts = np.stack([one.topography.ravel() for one in distinct])
         for one in alike:
@@ -136,7 +138,9 @@ def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _correlations(height: Array, layouts: Array) -> Array:
-    """Correlations of heights (pixels,), NaN where not measured, with layouts (n, pixels); 0 if flat."""
+    """Return the correlations of heights (pixels,), NaN where not measured, with layouts (n, pixels); 0 if
+    flat.
+    """
     seen = np.isfinite(height)
     own, others = (one - one.mean(axis=-1, keepdims=True) for one in (height[seen], layouts[:, seen]))
     energy = (others**2).sum(axis=1, dtype=float) * (own**2).sum(dtype=float)
@@ -145,7 +149,7 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Scans that lie mirrored or turned on their layout, unlike the others of the set or the card."""
+    """Yield scans that lie mirrored or turned on their layout, unlike the others of the set or the card."""
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
     for one in (one for one in prints if not one.turned):
         if one.dihedral != usual and 2 * count > len(prints):
@@ -157,7 +161,7 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Scans whose height per level fits another group better, and doses that are out of order."""
+    """Yield scans whose height per level fits another group better, and doses that are out of order."""
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
@@ -191,11 +195,12 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
-    """Slope of the heights over the blurred layout, µm per level; and its growth with the dose.
+    """Return the slope of the heights over the blurred layout, µm per level, and the slope's growth with the
+    dose.
 
     Exposure is level times dose, so the curve g of the heights over the blurred levels T also shows what a
     larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola
-    that is one plus the share of its square term in the slope; in a saturated print it is negative.
+    this is one plus the share of its square term in the slope; in a saturated print it is negative.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -207,7 +212,8 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
 
 
 def _edge_times(topography: Array, height: Array, slope: float) -> float:
-    """Deviation of the outermost pixels from the layout, as a multiple of that of the others; 0 if unknown.
+    """Return the deviation of the outermost pixels from the layout, as a multiple of that of the others; 0 if
+    unknown.
 
     ``slope``: height per blurred level, µm.
     """
@@ -222,7 +228,7 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Messages for the doses that are out of order, if the height per level clearly falls somewhere.
+    """Return messages for the doses that are out of order, if the height per level clearly falls somewhere.
 
     Args:
         rising: for each dose whose prints should rise with more dose: log of the height per level, number of
@@ -235,7 +241,7 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     falls = values[:, None] - values - _CLEAR_SIGMA * np.hypot.outer(error, error)
     if not (np.triu(falls, 1) > 0).any():
         return {}
-    # The rank of a value is the place of the dose that it belongs to.
+    # The rank of a value is the place of the dose to which it belongs.
     pairs = {k: sorted((k, int(rank))) for k, rank in enumerate(np.argsort(np.argsort(values)))}
     return {
         doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"

@@ -1,4 +1,6 @@
-"""One step of a build: an operation that is run and recorded, so its arrays can be traced and reproduced."""
+"""One step of a build: an operation that is run and recorded, so that its arrays can be traced and
+reproduced.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from litho_data.store.schema import VARIABLES
 PACKAGE = Path(__file__).parents[1]
 Arrays = dict[str, Array]
 Facts = dict[str, Any]
-# An operation: (parameters, raw files, input arrays by name) to arrays and facts.
+# An operation maps (parameters, raw files, input arrays by name) to arrays and facts.
 Params = Mapping[str, Any]
 Files = Sequence[Path]
 Inputs = Mapping[str, Array]
@@ -29,9 +31,9 @@ Function = Callable[[Params, Files, Inputs], Made]
 class Step:
     """One operation on one scan, with inputs, parameters and outputs.
 
-    ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), ``outputs``
-    are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source that
-    ran. It is recorded but is no part of the id, because moving a comment does not change a result.
+    ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), and ``outputs``
+    are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source code
+    that ran. It is recorded but is not part of the id, because moving a comment does not change a result.
     """
 
     op: str
@@ -43,17 +45,19 @@ class Step:
 
     @property
     def id(self) -> str:
-        """Hash of operation, version, parameters and input hashes: equal ids must give equal outputs."""
+        """Return the hash of operation, version, parameters and input hashes: equal ids must give equal
+        outputs.
+        """
         inputs = [[one["name"], one["sha256"]] for one in self.inputs]
         return record_sha256([self.op, self.op_version, self.params, inputs])
 
     def to_record(self) -> dict[str, Any]:
-        """Plain data, with the id."""
+        """Return the step as plain data, with its id."""
         return {"id": self.id, **asdict(self)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Step:
-        """The step of a record; the recorded id is not used, so that it can be compared."""
+        """Make the step of a record; the recorded id is not used, so that the two ids can be compared."""
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
 
@@ -79,13 +83,13 @@ class Operation:
 
     @property
     def code_sha256(self) -> str:
-        """Hash of the source that the result depends on."""
+        """Return the hash of the source code on which the result depends."""
         return _code_sha256(self.code)
 
     def run(
         self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]
     ) -> tuple[Step, Arrays, Facts]:
-        """Run the operation; returns its record and its arrays.
+        """Run the operation; return its record and its arrays.
 
         Args:
             params: explicit parameters, plain data.
@@ -118,7 +122,9 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """One thread for numerical libraries: sums do not depend on the cores, and workers do not compete."""
+    """Limit numerical libraries to one thread, so that sums do not depend on the cores and workers do not
+    compete.
+    """
     import cv2
     import scipy.linalg  # noqa: F401 - has its own BLAS, which can be limited only once it is loaded
     from threadpoolctl import threadpool_limits

@@ -1,4 +1,6 @@
-"""Find the best levelling recipe for a card, by the heights that the layout explains in three scans."""
+"""Find the best levelling recipe for a card: the one whose heights the layout explains best in three
+scans.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ method = "median-of-differences"
 }
 """The recipes that are compared, the simplest first."""
 _SCANS = 3
-# A recipe must leave less than this times what a simpler one leaves.
+# A recipe must leave less than this share of the residual of a simpler one.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
 _LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
@@ -66,7 +68,7 @@ class Suggestion:
     """The recipe that leaves the smallest residual, and the residual of every recipe and scan, nm.
 
     ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks
-    outside its fit; ``card`` is the written card; ``warned`` maps recipes to the warnings about them.
+    outside its fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
     """
 
     recipe: str
@@ -78,11 +80,11 @@ class Suggestion:
 def suggest_recipe(
     card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None
 ) -> Suggestion:
-    """Compare recipes on three scans of a card; write the best, a card that names it, and a page.
+    """Compare recipes on three scans of a card; write the best recipe, a card that names it, and a page.
 
     A free response to the blurred layout is fitted to the levelled heights in half of the blocks of 16 px.
-    Its residual in the other half decides: it contains both the tilt that a recipe leaves and the print that
-    it removes. A recipe that moves lines whose pixels did not move is not suggested.
+    The residual in the other half decides, because it contains both the tilt that a recipe leaves and the
+    print that it removes. A recipe that moves lines whose pixels did not move is not suggested.
 
     Args:
         card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
@@ -96,7 +98,7 @@ def suggest_recipe(
     if listing.card.scan.instrument == "sem":
         raise InputError("scans for comparing recipes", got="micrographs", wanted="scans of heights")
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
-    # Three scans far apart in the list; others if one of them cannot be used.
+    # The three scans are far apart in the list; if one of them cannot be used, another takes its place.
     places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()
     places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
@@ -132,20 +134,24 @@ def suggest_recipe(
 
 
 def _best(left_nm: Mapping[str, float]) -> str:
-    """The recipe with the smallest residual, or a simpler one (listed earlier) with nearly the same."""
+    """Return the recipe with the smallest residual, or a simpler one (listed earlier) with nearly the same
+    residual.
+    """
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
 def _located(job: FieldJob) -> tuple[Array, Array]:
-    """Raw heights (ny, nx) µm, and the layout in the scan's frame, NaN outside it."""
+    """Return the raw heights (ny, nx) µm, and the layout in the scan's frame, NaN outside it."""
     chain = job.begin()
     chain.run("locate", job.register_params(chain))
     return chain.arrays["raw_height_um"].astype(float), chain.arrays["layout_in_scan"]
 
 
 def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
-    """The heights, and objections to the recipe; a recipe that cannot be applied leaves them unchanged."""
+    """Return the heights, and objections to the recipe; if the recipe cannot be applied, the heights are
+    unchanged.
+    """
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
         levelled, notes = steps.apply_noting(raw_um, layout_level=layout)
@@ -155,7 +161,7 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Rms residual of a free response to the layout, in blocks outside its fit, µm.
+    """Return the rms residual of a free response to the layout, in blocks outside its fit, µm.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -174,7 +180,7 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
 
 
 def _write_card(card: Path, best: str) -> Path:
-    """Write the card with the recipe as its ``process.level``; the rest of its text stays as it was."""
+    """Write the card with the recipe as its ``process.level``; the rest of its text is unchanged."""
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))
     line = f'level = "{recipe.name}"'

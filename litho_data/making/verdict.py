@@ -12,12 +12,14 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# Ratios of heights to those of the layout, or of the other prints, beyond which a number is wrong.
+# A number is wrong if heights differ from those of the layout, or of the other prints, by more than these
+# factors.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # If the scales of the scans agree with each other but not with 1, the pitch of the card is wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
-# Measured prints lie at 1.1 to 1.5; simulated ones at 2 with a rim of substrate, at 6 to 8 without.
+# Measured prints have values of 1.1 to 1.5; simulated prints have 2 with a rim of substrate, and 6 to 8
+# without.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # Largest residual of levelling, as a share of the print's own standard deviation.
@@ -49,7 +51,7 @@ class Finding(Record):
 
 
 def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
-    """Scans whose height per level is far from that of the others, by id, with the reason."""
+    """Find scans whose height per level is far from that of the others; return the reasons by id."""
     gains = {one.id: abs(one.response[0]) for one in prints}
     if len(gains) < 3:
         return {}
@@ -63,7 +65,7 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def require_heights(prints: Sequence[Print], card: Card) -> None:
-    """Refuse a level height that has nothing to do with the prints, like a wavelength in nm.
+    """Refuse a level height that has nothing to do with the prints, such as a wavelength in nm.
 
     Raises:
         InputError: prints a hundred times higher or lower than their layouts say.
@@ -86,7 +88,7 @@ def findings(
     skipped: Mapping[str, str],
     card: Card,
 ) -> list[Finding]:
-    """Things to fix, worst first; empty for a good dataset.
+    """List things to fix, worst first; the list is empty for a good dataset.
 
     Args:
         records: records of the dataset's scans.
@@ -108,7 +110,9 @@ def findings(
 
 
 def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
-    """What is wrong with one scan; ``spread_nm`` holds the standard deviation of the heights by id."""
+    """Yield what is wrong with one scan; ``spread_nm`` contains the standard deviation of the heights by
+    id.
+    """
     quality = record["quality"]
     for note in record.get("notes", ()):
         yield note, Weight.NOTE
@@ -128,7 +132,9 @@ def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Ite
 def _of_the_card(
     records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Numbers of the card that the scans together contradict: the scan or all scans, the text, the weight."""
+    """Yield the numbers of the card that the scans together contradict: one scan or all, the text, and the
+    weight.
+    """
     layout = card.layout
     times = _height_times(prints, card)
     if times and not 1 / _TIMES < times < _TIMES:
@@ -165,13 +171,13 @@ def _of_the_card(
 
 
 def _scale(record: Mapping[str, Any]) -> float:
-    """Scale factor of a scan onto its layout; 0 if it was not registered."""
+    """Return the scale factor of a scan onto its layout; 0 if it was not registered."""
     low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
     return float(low * high) ** 0.5 if low * high > 0 else 0.0
 
 
 def _height_times(prints: Sequence[Print], card: Card) -> float:
-    """Height per level of the prints divided by that of the card; 0 if it is unknown."""
+    """Return the height per level of the prints divided by that of the card; 0 if it is unknown."""
     gains = [abs(one.response[0]) for one in prints]
     return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0
 
@@ -181,7 +187,7 @@ def _shown(times: float) -> str:
 
 
 def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
-    """The first words of the report: good, or a list of things to fix, worst first."""
+    """Return the first words of the report: good, or a list of things to fix, worst first."""
     if not found:
         return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
     shown = " · ".join(str(one) for one in found[:_SHOWN])

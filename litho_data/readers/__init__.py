@@ -1,4 +1,4 @@
-"""Instrument files in, ``Scan`` objects out; one module per format."""
+"""Read instrument files as ``Scan`` objects, with one module per format."""
 
 from litho_data.readers.layout import read_layout
 from litho_data.readers.read import list_channels, read_scan

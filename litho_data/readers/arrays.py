@@ -28,9 +28,9 @@ _UNKNOWN = re.compile(
     r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
     re.I,
 )
-# Numbers that turn counts into heights, as in m counts + b.
+# Numbers that convert counts into heights, as in m counts + b.
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# The same among the many other numbers beside or above an array.
+# The same numbers among the many others beside or above an array.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
     r"(z|heights?|data|values?|topography|add)[ _-]?offset",
@@ -47,9 +47,9 @@ _NO_COORDINATE = b"This is a netCDF dimension but not"
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Positions along one dimension and the unit that the file states, or a stated length alone.
+    """The positions along one dimension with the unit that the file states, or only a stated length.
 
-    ``axis``: x or y, if the file states it in addition to the name.
+    ``axis`` is x or y, if the file states it in addition to the name.
     """
 
     values: Array | None
@@ -58,7 +58,7 @@ class Coordinate:
     axis: str = ""
 
     def extent(self, count: int) -> float | None:
-        """Length from edge to edge; None if unknown.
+        """Return the length from edge to edge; None if unknown.
 
         Raises:
             InputError: uneven steps.
@@ -139,7 +139,7 @@ def array_channel(
 def _axes(
     dims: tuple[str, str], shape: Shape, known: Mapping[str, Coordinate]
 ) -> tuple[tuple[str, str], bool]:
-    """The names of y and x, and whether the first index runs along x.
+    """Return the names of y and x, and whether the first index runs along x.
 
     Dimensions without coordinates take the coordinates called x and y if the lengths match.
     """
@@ -161,7 +161,7 @@ def _changes(key: str, value: Any, counts: bool) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A number, a text, or a list of numbers."""
+    """Convert a value to a number, a text, or a list of numbers."""
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     if isinstance(value, Array):
@@ -183,7 +183,7 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
 
 @dataclass(frozen=True)
 class Held:
-    """An array in a file: type, shape, how to read it, and what the file says about it."""
+    """An array in a file: its type and shape, how to read it, and what the file says about it."""
 
     dtype: np.dtype
     shape: Shape
@@ -193,7 +193,7 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """An array that was read already."""
+        """Wrap an array that was already read."""
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
 
@@ -227,7 +227,9 @@ def channels_of(
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
-    """One channel per two-dimensional dataset of an open HDF5 file; MATLAB's are stored column by column."""
+    """Read one channel per two-dimensional dataset of an open HDF5 file; MATLAB's are stored column by
+    column.
+    """
     datasets: list[Any] = []
     file.visititems(
         lambda name, item: datasets.append(item) if len(getattr(item, "shape", ())) == 2 else None
@@ -292,7 +294,7 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str
 
 
 def _is_line(array: Any) -> bool:
-    """Whether an array holds numbers along one dimension; MATLAB's have two."""
+    """Return whether an array contains numbers along one dimension; in MATLAB files such arrays have two."""
     return array.dtype.kind in _NUMBERS and _size(array) > 1 and max(array.shape) == _size(array)
 
 
@@ -321,7 +323,9 @@ def _coordinate(values: Array, attributes: Mapping[str, Any]) -> Coordinate:
 
 
 def read_netcdf(path: Path) -> list[Channel]:
-    """One channel per two-dimensional variable of a NetCDF 3 file; scale, unit and missing by CF's names."""
+    """Read one channel per two-dimensional variable of a NetCDF 3 file; CF's names give scale, unit and
+    missing pixels.
+    """
     from scipy.io import netcdf_file
 
     with foreign_parser(path, "NetCDF"), netcdf_file(path, "r", mmap=False) as file:
@@ -335,7 +339,7 @@ def read_netcdf(path: Path) -> list[Channel]:
 
 
 def read_matlab(path: Path) -> list[Channel]:
-    """One channel per matrix of a MATLAB file, its rows along y."""
+    """Read one channel per matrix of a MATLAB file, with rows along y."""
     if path.open("rb").read(len(_MATLAB_7)) == _MATLAB_7:
         import h5py
 

@@ -1,8 +1,8 @@
 """Run other projects' parsers in a child process, within limits of time and memory.
 
 A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
-that reads starts one child with its first file and keeps it; a new child is needed only after a parser broke
-a limit.
+that reads files starts one child with its first file and keeps it. A new child is needed only after a parser
+broke a limit.
 """
 
 import atexit
@@ -27,7 +27,8 @@ _MIB = 1 << 20
 # Intact files take a hundredth of this time and a tenth of this memory.
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
-# Waiting time per computing time: a busy machine stays below it, a parser that waits for something does not.
+# Ratio of waiting time to computing time: a busy machine stays below it, but a parser that waits for
+# something does not.
 _WAITING_PER_COMPUTING = 20
 _OUT_OF_MEMORY = 3
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
@@ -63,7 +64,7 @@ class _Child:
         self._owner = 0
 
     def call(self, function: Callable[[], Any], path: Path, imports: tuple[str, ...]) -> Any:
-        """The function's result.
+        """Return the function's result.
 
         Raises:
             InputError: raised by the function, or because it took too long, needed too much memory or
@@ -108,7 +109,7 @@ class _Child:
         self._owner = os.getpid()
 
     def _end(self, error: Exception, computing_s: float) -> str:
-        """Why there is no answer."""
+        """Say why there is no answer."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
             self._process.kill()
@@ -120,7 +121,7 @@ class _Child:
         return f"a parser that crashed (exit code {code})"
 
     def stop(self) -> None:
-        """End the child, if this process started one."""
+        """End the child, if this process started it."""
         if self._process is not None and self._owner == os.getpid():
             self._process.kill()
             self._process.wait()
@@ -129,7 +130,7 @@ class _Child:
 
 
 def serve(descriptor: int) -> None:
-    """What the child does: run one function after another until its parent is gone."""
+    """Run one function after another in the child until its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe = Connection(descriptor)
     with suppress(EOFError):

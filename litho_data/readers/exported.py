@@ -21,7 +21,7 @@ _STL_HEADER_BYTES = 80
 
 
 def export_of(file: Path) -> dict[str, Any]:
-    """The sidecar that the design package wrote for an exported file; empty for other files.
+    """Return the sidecar that the design package wrote for an exported file; empty for other files.
 
     Raises:
         InputError: the sidecar belongs to another file.
@@ -39,7 +39,7 @@ def export_of(file: Path) -> dict[str, Any]:
 
 
 def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
-    """Levels of the element alone, uint8 (ny, nx), row 0 on top.
+    """Return the levels of the element alone, uint8 (ny, nx), row 0 on top.
 
     Raises:
         InputError: an incomplete sidecar, or a file that does not match it.
@@ -52,7 +52,7 @@ def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
 
 
 def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
-    """The levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
+    """Return the levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
 
     Raises:
         InputError: as ``exported_levels``.
@@ -94,7 +94,7 @@ class TiffRows:
 
 
 def _image_levels(path: Path, greys: Sequence[int]) -> Array:
-    """Levels uint8 (ny, nx) from an exported PNG or BMP.
+    """Return levels uint8 (ny, nx) from an exported PNG or BMP.
 
     Raises:
         InputError: no image, or a grey value between two levels.
@@ -144,7 +144,7 @@ def _gwl_levels(
     pedestal_um: float,
     slicing_um: float,
 ) -> Array:
-    """Levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
+    """Read levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
 
     Raises:
         InputError: columns of resist that are not a whole number of levels high.
@@ -176,7 +176,7 @@ def _gwl_levels(
 
 
 def read_stl_triangles(path: Path) -> Array:
-    """Corners float32 (n, 3, 3) of a binary STL, µm.
+    """Return the corners float32 (n, 3, 3) of a binary STL, µm.
 
     Raises:
         InputError: a file whose length does not fit its triangle count.

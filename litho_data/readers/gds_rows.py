@@ -1,4 +1,4 @@
-"""GDSII files of the design package: rectangles in cells that repeat, read a band of rows at a time."""
+"""Read GDSII files of the design package, one band of rows at a time: rectangles in cells that repeat."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _START = 0x0004080000060D02
 
 
 class GdsRows:
-    """The levels of a GDS file, uint8, row 0 on top; only the rows asked for are read."""
+    """The levels of a GDS file, uint8, row 0 on top; only the requested rows are read."""
 
     def __init__(self, path: Path, shape: Shape, pitch_um: float, layers: str):
         self.shape = shape
@@ -50,7 +50,7 @@ class GdsRows:
     def __getitem__(self, rows: slice) -> Array:
         top, bottom, _ = rows.indices(self.shape[0])
         low, high = self.shape[0] - bottom, self.shape[0] - top
-        # Each corner of a rectangle adds to everything above and to the right of it.
+        # Each corner of a rectangle adds to everything above it and to the right of it.
         steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
@@ -67,7 +67,7 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find where the shapes of every cell lie in the file, and which cells it refers to."""
+        """Find where the shapes of every cell are in the file, and to which cells it refers."""
         at, cell, name = 0, "", ""
         while True:
             # Only records of shapes are longer.
@@ -88,7 +88,7 @@ class GdsRows:
             at += length
 
     def _shapes_from(self, at: int) -> int:
-        """Number of rectangles that follow in the file."""
+        """Return the number of rectangles that follow in the file."""
         count = 0
         while True:
             start = at + count * _RECTANGLE.itemsize

@@ -1,4 +1,4 @@
-"""Gwyddion Simple Field, read and written: a text header, NUL padding, little-endian float32 rows."""
+"""Read and write Gwyddion Simple Field: a text header, NUL padding, little-endian float32 rows."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ _UM_PER_M = 1e6
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The one field of a GSF file; unit and size only if the header states them.
+    """Read the one field of a GSF file; it has a unit and a size only if the header states them.
 
     Raises:
         InputError: another format, a header without XRes and YRes or with a scale, or data of another length.
@@ -28,7 +28,7 @@ def read_channels(path: Path) -> list[Channel]:
     with about(str(path)):
         refuse_scales(header)
     shape = (_count(path, header, "YRes"), _count(path, header, "XRes"))
-    # At least one NUL, even if the header already ends on a multiple of four.
+    # There is at least one NUL, even if the header already ends on a multiple of four.
     start = (header_end // _ITEM + 1) * _ITEM
     wanted = shape[0] * shape[1] * _ITEM
     if header_end < 0 or len(raw) - start != wanted:
@@ -77,7 +77,9 @@ def _size_um(header: dict[str, str]) -> YX | None:
 
 
 def gsf_bytes(height_um: Array, pitch_um: YX | None, title: str = "") -> bytes:
-    """A GSF file of heights (ny, nx) in µm, stored as float32 metres; NaN where not measured."""
+    """Return the bytes of a GSF file of heights (ny, nx) in µm, stored as float32 metres; NaN where not
+    measured.
+    """
     ny, nx = height_um.shape
     fields = {"XRes": str(nx), "YRes": str(ny), "ZUnits": "m", "Title": " ".join(title.split())}
     if pitch_um is not None:

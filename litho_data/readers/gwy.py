@@ -1,4 +1,4 @@
-"""Gwyddion's own files: every data field becomes a channel, and a mask stays a mask."""
+"""Read Gwyddion's own files: every data field becomes a channel, and a mask stays a mask."""
 
 import re
 import struct
@@ -19,7 +19,7 @@ _FIELD_KEY = re.compile(r"/(\d+)/data")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per data field; heights under a mask are kept, together with the mask.
+    """Read one channel per data field; heights under a mask are kept, together with the mask.
 
     A pixel counts as masked where the mask is above zero. The metadata that Gwyddion keeps for a
     channel is its header.
@@ -73,12 +73,12 @@ def _pixels(what: str, field: dict[str, Any], shape: Shape) -> Array:
 
 
 def _unit(field: dict[str, Any], key: str) -> str | None:
-    """None if Gwyddion states no unit, as it does for pure numbers."""
+    """Return the unit; None if Gwyddion states no unit, as it does for pure numbers."""
     return str(field.get(key, {}).get("unitstr", "")) or None
 
 
 def _object(data: bytes, start: int, limit: int) -> tuple[dict[str, Any], int]:
-    """The components of an object by name, and where it ends.
+    """Read the components of an object by name; also return where the object ends.
 
     Raises:
         ValueError, struct.error: a size that does not fit.
@@ -121,7 +121,7 @@ def _count(data: bytes, at: int) -> int:
 
 
 def _text(data: bytes, start: int, limit: int) -> tuple[str, int]:
-    """The text before the closing NUL, and the position after it."""
+    """Return the text before the closing NUL, and the position after it."""
     end = data.find(b"\0", start, limit)
     if end < 0:
         raise ValueError(f"a string at {start} does not end")

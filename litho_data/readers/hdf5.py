@@ -1,4 +1,4 @@
-"""HDF5 files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results), and all others."""
+"""Read HDF5 files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results), and all others."""
 
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,8 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """JPK, Nanosurf: one channel per signal and direction. TopoStats: the flattened and the raw image, nm.
+    """Read one channel per signal and direction from JPK and Nanosurf files. From TopoStats files, read the
+    flattened and the raw image, nm.
 
     Thumbnails, traces of grains and other tables are skipped.
 
@@ -61,7 +62,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
-    """Signals of one measurement: values (pixel, frame), with pixels in the order of ``Position_Indices``."""
+    """Read the signals of one measurement: values (pixel, frame), with pixels in the order of
+    ``Position_Indices``.
+    """
     grid = {key: measurement.attrs[f"position-pattern.grid.{key}"] for key in ("ilength", "jlength")}
     size_m = [float(measurement.attrs[f"position-pattern.grid.{key}length"]) for key in "vu"]
     shape = int(grid["jlength"]), int(grid["ilength"])
@@ -88,7 +91,7 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
 
 
 def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
-    """Values in the default calibration; y of the grid points up, so its last row comes first."""
+    """Read values in the default calibration; y of the grid points up, so the last row comes first."""
     import h5py
 
     with foreign_parser(path, "HDF5"), h5py.File(path) as file:
@@ -102,7 +105,7 @@ def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
 
 
 def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
-    """One channel per signal of every image and direction; other groups hold no images."""
+    """Read one channel per signal of every image and direction; other groups contain no images."""
     import h5py
 
     channels = []
@@ -119,7 +122,9 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """The range of the counts' type stands for the calibrated range; rows and columns stay as stored."""
+    """Make a channel whose type of counts has the calibrated range as its range; rows and columns stay as
+    stored.
+    """
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])
         x_m, y_m = (float(one) for one in says.get("rect_axis_range", (0, 0)))

@@ -1,4 +1,6 @@
-"""Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
+"""Read layouts, that is, what was sent to the printer, as integer levels, from files of levels or pictures of
+them.
+"""
 
 from pathlib import Path
 
@@ -21,10 +23,10 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Levels of a layout, uint8 (ny, nx), row 0 on top.
+    """Read the levels of a layout, uint8 (ny, nx), row 0 on top.
 
-    TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
-    grey if its colours are identical. A file that the design package exported, in any format, is read with
+    The file may be TIFF (any compression of tifffile and imagecodecs), PNG, BMP or NPY; a colour image counts
+    as grey if its colours are identical. A file that the design package exported, in any format, is read with
     the help of the sidecar beside it.
 
     Args:
@@ -58,7 +60,7 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Numbers of light pixels in squares of a picture in two greys."""
+    """Count the light pixels in squares of a picture in two greys."""
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:
@@ -70,7 +72,7 @@ def _averaged(file: Path, pixels: Array, side: int) -> Array:
 
 
 def _white_step(pixels: Array, levels: int | None) -> float:
-    """The step of a picture whose white is the highest level; 1 for levels."""
+    """Return the grey step of a picture whose white is the highest level; 1 for levels."""
     if levels is None or pixels.max() < levels:
         return 1.0
     for step in (one for white in _WHITE for one in (white / (levels - 1), float(white // (levels - 1)))):

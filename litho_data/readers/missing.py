@@ -12,20 +12,21 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# Distance from the other values, in spans, from which an unknown number counts as a mark; larger for a lone
-# pixel.
+# An unknown number at this distance from the other values, in spans, counts as a mark; a lone pixel must be
+# farther away.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
-# Relative tolerance: values are held as float32, and very large ones are written with few digits.
+# Relative tolerance: values are stored as float32, and very large values are written with few digits.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# Share of the pixels, number, and multiple of the mean count from which an extreme value is suspicious.
+# An extreme value is suspicious from this share of the pixels, this number, and this multiple of the mean
+# count on.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
 def without_missing(
     file: Path, channel: Channel, values: Array, missing: Sequence[float | str] | None
 ) -> Array:
-    """The values with NaN where they mark a missing pixel.
+    """Return the values with NaN where they mark a missing pixel.
 
     Args:
         file: for messages.
@@ -56,7 +57,9 @@ def without_missing(
 
 
 def _marks(values: Array) -> list[tuple[float, int]]:
-    """Extreme values that look like marks, the most extreme first, and the number of their pixels."""
+    """Return the extreme values that look like marks, the most extreme first, and the number of their
+    pixels.
+    """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     found: list[tuple[float, int]] = []
     while len(numbers) > _FEWEST_VALUES:
@@ -73,7 +76,7 @@ def _marks(values: Array) -> list[tuple[float, int]]:
 
 
 def extreme_note(values: Array) -> str:
-    """A note on a map whose lowest or highest value fills many pixels; empty for others."""
+    """Return a note on a map whose lowest or highest value fills many pixels; empty for others."""
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):
         return ""

@@ -1,4 +1,4 @@
-"""NumPy arrays in ``.npy`` and ``.npz`` files; pickled objects are refused."""
+"""Read NumPy arrays from ``.npy`` and ``.npz`` files; pickled objects are refused."""
 
 import zipfile
 from functools import partial
@@ -20,7 +20,7 @@ _READ_HEADER = {
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The one channel of a two-dimensional array; a ``.npy`` file states neither unit nor size.
+    """Read the one channel of a two-dimensional array; a ``.npy`` file states neither unit nor size.
 
     Raises:
         InputError: damaged file, or not a two-dimensional array of numbers.
@@ -32,7 +32,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def read_archive(path: Path) -> list[Channel]:
-    """One channel per two-dimensional array of numbers in an ``.npz`` file; other arrays are skipped.
+    """Read one channel per two-dimensional array of numbers in an ``.npz`` file; other arrays are skipped.
 
     Single values and one-dimensional arrays beside them give the unit and the axes, as in a MATLAB file.
 
@@ -59,7 +59,7 @@ def _member(path: Path, name: str) -> Array:
 
 
 def load_array(path: Path) -> Array:
-    """The array of a ``.npy`` file, mapped and not yet read.
+    """Map the array of a ``.npy`` file without reading it.
 
     Raises:
         InputError: damaged file, pickled objects, or values that are not real numbers.
@@ -76,7 +76,7 @@ def load_array(path: Path) -> Array:
 
 
 def _is_archive(head: bytes) -> bool:
-    """Whether the first file in a ZIP is an array; its name follows a header of 30 bytes."""
+    """Return whether the first file in a ZIP is an array; its name follows a header of 30 bytes."""
     length = int.from_bytes(head[26:28], "little")
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 

@@ -1,4 +1,4 @@
-"""Files that hold another file in packed form: gzip, and Digital Surf's compressed surfaces."""
+"""Unpack files that contain another file: gzip, and Digital Surf's compressed surfaces."""
 
 import gzip
 import struct
@@ -15,7 +15,7 @@ _GZIP = b"\x1f\x8b"
 _SURF, _PACKED_SURF = b"DIGITAL SURF", b"DSCOMPRESSED"
 _MOST_BYTES = 1 << 30
 _PIECE = 1 << 20
-# Place of the sizes of comment and private zone, which follow the 512 bytes of Digital Surf's header.
+# Position of the sizes of comment and private zone, which follow the 512 bytes of Digital Surf's header.
 _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 
@@ -54,7 +54,9 @@ def _unpack_gzip(path: Path, content: Path) -> None:
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
-    """Copy header, comment and private zone; then come a count, the sizes of the streams, and the streams."""
+    """Copy header, comment and private zone; after these the file has a count, the sizes of the streams, and
+    the streams.
+    """
     raw = path.read_bytes()
     start = _SURF_HEADER + sum(struct.unpack_from("<2H", raw, _SURF_ZONES))
     (count,) = struct.unpack_from("<I", raw, start)

@@ -1,7 +1,7 @@
-"""Fields in the authors' pair format: 8-bit layouts and heights, cut into four quadrants.
+"""Read fields in the authors' pair format: 8-bit layouts and heights, cut into four quadrants.
 
-A grey value means value / 255 · full scale. The format has no validity, no negative heights and 256 grey
-values, so it loses accuracy.
+A grey value stands for value / 255 · full scale. The format has no validity, no negative heights and only 256
+grey values, so it loses accuracy.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ GREY_MAX = 255
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
 ) -> dict[str, Array]:
-    """One field from its layouts and heights (first all layouts, then all heights, in quadrant order).
+    """Join one field from its layouts and heights (first all layouts, then all heights, in quadrant order).
 
     Raises:
         InputError: unreadable files, quadrants of different sizes, levels above the stated number.
@@ -44,7 +44,7 @@ def stitch_field(
 
 
 def quadrant_slices(quadrant: int, shape: Shape) -> tuple[slice, slice]:
-    """Rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
+    """Return the rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
     if quadrant == 0:
         return slice(None), slice(None)
     ny, nx = shape[0] // 2, shape[1] // 2

@@ -1,4 +1,4 @@
-"""Pictures: one grey value per pixel, from TIFF, PNG, BMP and NPY."""
+"""Read pictures with one grey value per pixel, from TIFF, PNG, BMP and NPY."""
 
 from pathlib import Path
 
@@ -12,7 +12,8 @@ from litho_data.readers.tiff import open_tiff, require_upright, single_sample
 
 
 def read_picture(path: str | Path, what: str = "picture") -> Array:
-    """The stored numbers (ny, nx), row 0 on top; a colour image counts as grey if its colours are identical.
+    """Read the stored numbers (ny, nx), row 0 on top; a colour image counts as grey if its colours are
+    identical.
 
     Args:
         path: the file.
@@ -35,7 +36,7 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
 
 
 def value_range(pixels: Array) -> str:
-    """Type and range of the numbers, for messages."""
+    """Describe the type and range of the numbers, for messages."""
     if pixels.dtype.kind not in "uif":
         return str(pixels.dtype)
     return f"{pixels.dtype} from {pixels.min():g} to {pixels.max():g}"

@@ -1,4 +1,4 @@
-"""Reading one scan: format, channel, unit and size are decided here, in one place for all formats."""
+"""Read one scan: format, channel, unit and size are decided here for all formats."""
 
 import re
 from collections.abc import Sequence
@@ -102,10 +102,10 @@ def read_scan(
 
 
 def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
-    """All channels of a file, heights and others, without choosing one.
+    """Return all channels of a file, heights and others, without choosing one.
 
     Raises:
-        InputError: unreadable or of unknown format.
+        InputError: the file is unreadable or has an unknown format.
     """
     given = require_file(path)
     with unpacked(given) as file:
@@ -135,7 +135,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:
-    """A name may state the unit, as ``height_nm`` does."""
+    """Take the unit from the name of a channel if it states one, as ``height_nm`` does."""
     ends = _NAMED_UNIT.search(channel.name)
     return replace(channel, unit=ends[1]) if ends and channel.unit is None else channel
 
@@ -169,7 +169,7 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
 def _settle_unit(
     file: Path, channel: Channel, values: Array, unit: str | None, full_scale_um: float | None
 ) -> tuple[str, float]:
-    """The unit of the file and the factor from its values to µm."""
+    """Return the unit of the file, and the factor from its values to µm."""
     if full_scale_um is not None:
         if channel.full_scale is None or channel.unit is not None or unit is not None:
             raise InputError(f"{file}: full scale", got=full_scale_um, wanted="an integer image and no unit")
@@ -190,7 +190,9 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """The values in µm; a factor below one is applied as a division, so that 100 nm is exactly 0.1 µm."""
+    """Convert the values to µm; a factor below one is applied as a division, so that 100 nm is exactly 0.1
+    µm.
+    """
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
 
@@ -207,7 +209,9 @@ def _settle_pitch(file: Path, channel: Channel, size_um: YX | None, unit: str) -
 
 
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
-    """(y, x) in µm of coordinates without a unit: in µm or in the heights' unit, if only one makes sense."""
+    """Return (y, x) in µm for coordinates without a unit: in µm or in the heights' unit, if only one makes
+    sense.
+    """
     if channel.extent is None or channel.full_scale is not None:
         return None
     sizes = {(channel.extent[0] * factor, channel.extent[1] * factor) for factor in (1.0, um_per(unit))}

@@ -19,14 +19,15 @@ from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.scan import Axis
 
-# 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
+# 2 GiB as float64: beyond this size, a damaged header is far more likely than a scan.
 _MAX_PIXELS = 2**28
-# The limit of Deflate, the strongest compression in use.
+# This is the limit of Deflate, the strongest compression in use.
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
-# What parsers say about a truncated or changed file; any other message is about an unknown kind of file.
+# What parsers say about a truncated or changed file; any other message means that the kind of file is
+# unknown.
 _CUT = re.compile(
     r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
     r"crc|incomplete|reach(es)? beyond",
@@ -83,11 +84,11 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Whether the unit is a length, or is left to the caller."""
+        """Return whether the unit is a length, or must be stated by the caller."""
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
-        """Name, size and unit in a few words, for messages."""
+        """Return the name, size and unit in a few words, for messages."""
         if self.problem:
             return f"{self.name!r} (not read: {self.problem})"
         unit = "no unit" if self.unit is None else self.unit
@@ -110,7 +111,7 @@ class Reader:
 
 
 def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
-    """The channel, or one that says why it cannot be read, so that the other channels stay usable."""
+    """Make a channel, or one that says why it cannot be read, so that the other channels stay usable."""
     try:
         with foreign_parser(path, kind):
             return make()
@@ -123,7 +124,7 @@ def _refuse(problem: str) -> Loaded:
 
 
 def in_memory(values: Array) -> Callable[[], Loaded]:
-    """A loader for a map that has been read already."""
+    """Make a loader for a map that has already been read."""
     return partial(_copied, values)
 
 
@@ -132,7 +133,9 @@ def _copied(values: Array) -> Loaded:
 
 
 def extent_um(y: float, x: float, unit: str | None) -> YX | None:
-    """(y, x) in µm of a stated extent; None unless both are positive and the unit is a length."""
+    """Convert a stated extent to (y, x) in µm; return None unless both are positive and the unit is a
+    length.
+    """
     if unit is None or not is_length(unit):
         return None
     size = float(y) * um_per(unit), float(x) * um_per(unit)
@@ -140,7 +143,7 @@ def extent_um(y: float, x: float, unit: str | None) -> YX | None:
 
 
 def unknown_content(path: Path, head: bytes) -> InputError:
-    """The error for a file that no reader recognises."""
+    """Return the error for a file that no reader recognises."""
     return InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
@@ -175,7 +178,7 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
     """Run another project's parser; any exception becomes one InputError about the file.
 
     On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
-    errors, and log to stderr; a caller can do nothing with these.
+    errors, and log to stderr. A caller could not handle these errors in any useful way.
     """
     try:
         with quiet(*_LOGGERS):

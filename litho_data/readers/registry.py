@@ -1,4 +1,4 @@
-"""The formats that can be read; the format of a file follows from its content, never from its suffix."""
+"""The formats that can be read; a file's format follows from its content, never from its suffix."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, sxm, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
-# In the order in which they are tried: formats with a signature first, then containers and texts that any
-# program writes.
+# Readers are listed in the order in which they are tried: first formats with a signature, then containers and
+# texts that any program writes.
 _READERS = [
     gsf.READER,
     gwy.READER,
@@ -29,12 +29,12 @@ _HEAD_BYTES = 1 << 16
 
 
 def formats() -> tuple[str, ...]:
-    """The names of all formats, in the order in which a file is tried on them."""
+    """Return the names of all formats, in the order in which they are tried on a file."""
     return tuple(reader.name for reader in _READERS)
 
 
 def register_reader(reader: Reader) -> Reader:
-    """Register a reader of another format; it is tried before the existing ones.
+    """Register a reader of another format; it is tried before the existing readers.
 
     To build in several processes, call this in a plug-in, or in the script that starts the build, at its top
     level.
@@ -49,7 +49,7 @@ def register_reader(reader: Reader) -> Reader:
 
 
 def reader_of(format: str) -> Reader:
-    """The reader of that name.
+    """Return the reader of that name.
 
     Raises:
         InputError: there is none.
@@ -61,7 +61,7 @@ def reader_of(format: str) -> Reader:
 
 
 def detect_format(path: Path) -> str:
-    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP.
+    """Return the name of the first format that recognises the file; ``"image"`` for PNG and BMP.
 
     Raises:
         InputError: none does.
@@ -77,7 +77,7 @@ def detect_format(path: Path) -> str:
 
 
 def require_file(path: str | Path) -> Path:
-    """The path, if it is a file that is not empty.
+    """Return the path, if it is a file that is not empty.
 
     Raises:
         InputError: no such file, a folder, not readable, or empty.

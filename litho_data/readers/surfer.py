@@ -1,4 +1,4 @@
-"""Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), y upwards."""
+"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), y upwards."""
 
 import struct
 from pathlib import Path
@@ -16,7 +16,8 @@ _GRID = struct.Struct("<2i8d")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The one grid; its coordinates are those of the pixel centres, in a unit that the file does not state.
+    """Read the one grid; its coordinates are those of the pixel centres, in a unit that the file does not
+    state.
 
     Raises:
         InputError: a damaged file.
@@ -57,7 +58,7 @@ def _binary_6(raw: bytes) -> tuple[Array, float, float, float]:
 
 
 def _binary_7(raw: bytes) -> tuple[Array, float, float, float]:
-    """Sections of tag, size and content: GRID holds the geometry, and DATA after it the heights."""
+    """Read sections of tag, size and content: GRID contains the geometry, and DATA after it the heights."""
     position, grid = 0, None
     while position < len(raw):
         tag, size = struct.unpack_from("<4si", raw, position)

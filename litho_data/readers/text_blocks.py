@@ -1,4 +1,4 @@
-"""Text files cut into blocks of numbers, each with the lines of words above it."""
+"""Cut text files into blocks of numbers, each with the lines of words above it."""
 
 import codecs
 import re
@@ -18,8 +18,8 @@ NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+
 _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
-# A semicolon may also stand before the first cell of a row.
-# Error cells of a spreadsheet begin like a comment.
+# A semicolon may also stand before the first cell of a row. In a spreadsheet, cells with errors begin like a
+# comment.
 _COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
@@ -29,11 +29,11 @@ _FEWEST_NULS = 0.8
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
-# Keys are compared by their letters and digits only.
+# Keys are compared only by their letters and digits.
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 _KEYS: dict[str, list[str]] = WORDS["keys"]
-# The unit of a column or of all numbers, as in "Height [nm]"; before a number it belongs to a length.
+# The unit of a column or of all numbers, as in "Height [nm]"; in front of a number it belongs to a length.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
     r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
@@ -63,18 +63,20 @@ class Block:
     rows: list[str] = field(default_factory=list)
 
     def first(self, *keys: str) -> str:
-        """The header's value for the first of these keys that it contains; empty if it contains none."""
+        """Return the header's value for the first of these keys that it contains; empty if it contains
+        none.
+        """
         lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
         return next((lower[name] for key in keys for name in _KEYS.get(key, [key]) if name in lower), "")
 
     @property
     def name(self) -> str:
-        """Name of the channel, if the header gives one."""
+        """Return the name of the channel, if the header gives one."""
         return self.first("channel")
 
     @property
     def unit(self) -> str | None:
-        """Unit of the values; None if the header states none."""
+        """Return the unit of the values; None if the header states none."""
         if self.factor is not None:
             return "m"
         titled = [unit for text in self.words for unit in _TITLED.findall(text[:200])]
@@ -95,7 +97,7 @@ class Block:
 
     @property
     def factor(self) -> float | None:
-        """Factor from values to metres, if the header gives one.
+        """Return the factor from values to metres, if the header gives one.
 
         Raises:
             InputError: the header gives a scale of an unknown kind.
@@ -112,12 +114,12 @@ class Block:
 
     @property
     def missing(self) -> list[float]:
-        """The numbers that mark missing pixels according to the header."""
+        """Return the numbers that mark missing pixels according to the header."""
         stated = self.first("missing")
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
-        """(y, x) from the two sides, or from the size of a pixel, µm."""
+        """Return (y, x), µm, from the two sides, or from the size of a pixel."""
         if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(side)) for side in ("height", "width")]
@@ -136,7 +138,8 @@ def refuse_scales(header: Mapping[str, str]) -> None:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, lines separated by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western Europe.
+    """Read the text of a file, with lines separated by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western
+    Europe.
 
     Raises:
         InputError: UTF-16 with an incomplete character, or bytes that are no text; the message names the
@@ -164,12 +167,12 @@ def read_text(path: Path) -> str:
 
 
 def without_quotes(text: str) -> str:
-    """The text with quotes only where a cell holds a comma."""
+    """Remove quotes from the text, except where a cell contains a comma."""
     return _QUOTED.sub(r"\1", text)
 
 
 def blocks_of(text: str) -> list[Block]:
-    """The blocks of numbers in a text; blank lines and lines of words end a block.
+    """Find the blocks of numbers in a text; blank lines and lines of words end a block.
 
     A line counts as words only if less than half of its cells are numbers; otherwise it is a row of the
     block, with words in place of numbers. If every other line is blank, all rows are one block.
@@ -177,7 +180,7 @@ def blocks_of(text: str) -> list[Block]:
     found = list(_blocks(text))
     if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):
         for one in found[1:]:
-            # Blank lines keep the line numbers right.
+            # Blank lines are inserted to keep the line numbers right.
             found[0].rows += [""] * (one.first_line - found[0].first_line - len(found[0].rows)) + one.rows
         return found[:1]
     return found
@@ -201,7 +204,7 @@ def _blocks(text: str) -> Iterator[Block]:
 
 
 def header_of(text: str) -> Block:
-    """The header made of lines of words, without numbers below them."""
+    """Make the header from lines of words that have no numbers below them."""
     block = Block({}, [], 0)
     for number_of_line, line in enumerate(text.splitlines(), start=1):
         block.words.append(line.strip())
@@ -210,9 +213,10 @@ def header_of(text: str) -> Block:
 
 
 def is_row(line: str) -> bool:
-    """Whether a line is a row of numbers: it is no comment, and at least half of its cells are numbers.
+    """Return whether a line is a row of numbers: it is not a comment, and at least half of its cells are
+    numbers.
 
-    A line that repeats one word, which is no unit, is a row of missing pixels.
+    A line that repeats one word that is not a unit is a row of missing pixels.
     """
     if _COMMENT.match(line) or not line.strip():
         return False
@@ -230,7 +234,7 @@ def is_row(line: str) -> bool:
 
 
 def cells_of(line: str) -> list[str]:
-    """The cells of a line, separated by blanks, tabs, commas or semicolons."""
+    """Return the cells of a line, separated by blanks, tabs, commas or semicolons."""
     return _SEPARATORS.split(line.strip(" \t,;"))
 
 
@@ -250,7 +254,9 @@ def _note(line: str, header: dict[str, str], number_of_line: int) -> None:
 
 
 def number(text: str) -> float:
-    """The number at the start of a text, with a decimal comma or Fortran's exponent; NaN if there is none."""
+    """Read the number at the start of a text, with a decimal comma or Fortran's exponent; NaN if there is
+    none.
+    """
     found = NUMBER.match(text.strip())
     return float(re.sub("[dD]", "e", found[0]).replace(",", ".")) if found else float("nan")
 

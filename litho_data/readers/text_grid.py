@@ -1,4 +1,4 @@
-"""Coordinates in a table of numbers: axes in the first row and column, or points that fill a grid."""
+"""Find coordinates in a table of numbers: axes in the first row and column, or points that fill a grid."""
 
 import re
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.units import is_length, um_per
 
-# Coordinates are written with few digits: a step may be off by this share of the usual one.
+# Coordinates are written with few digits, so a step may differ from the usual one by this share.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
 # A single axis or uneven axes need more numbers.
@@ -27,9 +27,9 @@ _AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 on top, x to the right, and the lengths in the table; ``extent`` has no unit.
+    """Heights with row 0 on top and x to the right, and the lengths in the table; ``extent`` has no unit.
 
-    ``corner``: whether the first cell belonged to axes."""
+    ``corner`` says whether the first cell belonged to axes."""
 
     values: Array
     extent: YX | None = None
@@ -40,7 +40,7 @@ class Map:
 
 
 def without_axes(values: Array, words: Sequence[str]) -> Map:
-    """The matrix without a first row or column of coordinates or counts.
+    """Remove a first row or column of coordinates or counts from the matrix.
 
     Evenly spaced numbers are coordinates if the neighbouring line is not like them, because neighbouring
     lines of a map are alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing about
@@ -81,7 +81,7 @@ def _rises(line: Array) -> bool:
 
 
 def _spacing(line: Array) -> float | None:
-    """The step of evenly spaced numbers; None for others."""
+    """Return the step of evenly spaced numbers; None for other numbers."""
     steps = np.diff(line)
     if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all():
         return None
@@ -99,7 +99,7 @@ def _counts(line: Array) -> bool:
 
 
 def _size_um(words: Sequence[str], extent: YX) -> YX | None:
-    """(y, x) in µm, where the words above the numbers give units for x and y."""
+    """Return (y, x) in µm, if the words above the numbers give units for x and y."""
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
     if "x" not in units:
@@ -108,7 +108,9 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 
 
 def _columns(words: Sequence[str], count: int) -> list[int]:
-    """The columns of x, y and z by the words above them, or the only three columns; otherwise none."""
+    """Find the columns of x, y and z by the words above them, or take the only three columns; otherwise
+    return none.
+    """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))
         axes = [found[0] or "z" if (found := _AXIS.match(name)) else "" for name in names]
@@ -118,7 +120,7 @@ def _columns(words: Sequence[str], count: int) -> list[int]:
 
 
 def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
-    """The map of points that fill a regular grid; None if they do not.
+    """Make a map of points that fill a regular grid; return None if they do not.
 
     The columns are x, y, z unless words say otherwise. The rows keep the order of the file; x grows to the
     right. Grid points that the file lacks are missing pixels.

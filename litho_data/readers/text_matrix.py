@@ -1,4 +1,4 @@
-"""Height maps as text: one or several matrices, with or without axes, or the points of a grid."""
+"""Read height maps from text: one or several matrices, with or without axes, or the points of a grid."""
 
 import re
 from functools import partial
@@ -20,7 +20,8 @@ _IGOR = "IGOR\n"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per block of numbers; unit and size only if the lines above the numbers state them.
+    """Read one channel per block of numbers; unit and size are known only if the lines above the numbers
+    state them.
 
     Lines of words, and lines that start with ``#``, ``%`` or ``;``, are the header of what follows. Axes in
     the first row and column, and points that lie on a regular grid, become a map.
@@ -104,7 +105,7 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    """Whether the file begins like a text with rows of numbers.
+    """Return whether the file begins like a text with rows of numbers.
 
     Raises:
         InputError: the rows are points of a profile or of a cloud.
@@ -119,7 +120,7 @@ def _recognises(path: Path, head: bytes) -> bool:
 
 
 def _refuse_points(path: Path) -> None:
-    """A table of points is a map only if they fill a grid, unless the caller says that it is a matrix."""
+    """Refuse a table of points unless they fill a grid or the caller says that it is a matrix."""
     for block in blocks_of(read_text(path)):
         table = numbers_of(path, block)
         columns = table.values.shape[1]
@@ -132,7 +133,7 @@ def _refuse_points(path: Path) -> None:
 
 
 def _start_of_text(head: bytes) -> str:
-    """The beginning as text; empty if the bytes are not text."""
+    """Return the beginning of the file as text; empty if the bytes are not text."""
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return head[: len(head) // 2 * 2].decode("utf-16", errors="ignore")
     if b"\0" in head:

@@ -1,4 +1,4 @@
-"""Rows of text turned into numbers: separators, decimal commas, words in place of numbers, damage."""
+"""Convert rows of text to numbers: separators, decimal commas, words in place of numbers, damage."""
 
 import io
 import re
@@ -32,7 +32,7 @@ class Table:
 
 
 def numbers_of(path: Path, block: Block) -> Table:
-    """The numbers of a block; ``nan`` and words are NaN, an empty cell is the word "".
+    """Convert a block to numbers; ``nan`` and words are NaN, and an empty cell is the word "".
 
     A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
 
@@ -61,9 +61,9 @@ def _numbers(path: Path, text: str, first_line: int) -> Table:
 
 
 def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
-    """The text with decimal points, and the separator of its cells; None for blanks.
+    """Return the text with decimal points, and the separator of its cells; None stands for blanks.
 
-    Commas separate cells only if nothing else does; otherwise they are decimal commas, and the file has no
+    Commas separate cells only if nothing else does. Otherwise they are decimal commas, and the file has no
     decimal points.
 
     Raises:

@@ -1,4 +1,4 @@
-"""TIFF images: every page is a channel; values stay as stored."""
+"""Read TIFF images: every page is a channel, and values stay as stored."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _ORIENTATION, _UPRIGHT = 274, 1
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
-# Some makers keep heights beside a picture in private tags.
+# Some makers store heights beside a picture in private tags.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
 _LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
@@ -38,7 +38,7 @@ _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per page; RGB pages count as one channel if their samples are identical.
+    """Read one channel per page; RGB pages count as one channel if their samples are identical.
 
     The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their
     unit; otherwise these usually describe paper, not the sample. Calibrations of the values by ImageJ and
@@ -61,7 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[TiffFile]:
-    """A TIFF file, open; any error of a damaged one becomes an InputError."""
+    """Open a TIFF file; any error of a damaged file becomes an InputError."""
     import tifffile
 
     with foreign_parser(path, "TIFF"), tifffile.TiffFile(path) as file:
@@ -82,7 +82,9 @@ def require_upright(path: Path, page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """SurfaceTopography's name of the format whose maker signs this TIFF; empty if none does."""
+    """Return SurfaceTopography's name for the format of the maker that signs this TIFF; empty if no maker
+    does.
+    """
     try:
         with open_tiff(path) as file:
             tags = file.pages.first.tags
@@ -134,7 +136,7 @@ def _may_hold_heights(tag: Any, shape: Shape) -> bool:
 def _calibration(
     what: str, page: Any, imagej: dict[str, Any]
 ) -> tuple[float, float, str | None, float | None]:
-    """Scale, offset, unit and no-data value of a page.
+    """Return scale, offset, unit and no-data value of a page.
 
     Raises:
         InputError: a calibration of ImageJ that is no straight line, or an unknown scale in the description.
@@ -161,7 +163,7 @@ def _calibration(
 
 
 def _plain_text(description: str) -> str:
-    """A description as lines of keys and values, even if it is JSON."""
+    """Convert a description to lines of keys and values, even if it is JSON."""
     try:
         return "\n".join(f"{key}: {value}" for key, value in json.loads(description).items())
     except (ValueError, AttributeError):  # no JSON, or no object
@@ -173,9 +175,10 @@ def _plain_unit(unit: Any) -> str:
 
 
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
-    """(y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
+    """Read (y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
 
-    Pages belong to the images in turn; each image has as many pages as its sizes in z, channel and time say.
+    The pages belong to the images in turn, and each image has as many pages as its sizes in z, channel and
+    time say.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
@@ -185,7 +188,7 @@ def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
 
 
 def _ome_pitch_um(image: str) -> YX | None:
-    """(y, x) that the element of one image states."""
+    """Read (y, x) that the element of one image states."""
     says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
         pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]
@@ -220,7 +223,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
 
 
 def single_sample(path: Path, pixels: Array) -> Array:
-    """(ny, nx) from (ny, nx), or from opaque (ny, nx, 1 to 4) with identical colours.
+    """Reduce to (ny, nx) from (ny, nx), or from opaque (ny, nx, 1 to 4) with identical colours.
 
     Raises:
         InputError: the colours differ, so a pixel has no single value, or pixels are transparent.
@@ -240,7 +243,7 @@ def single_sample(path: Path, pixels: Array) -> Array:
 
 
 def is_tiff(head: bytes) -> bool:
-    """Whether a file begins like a TIFF."""
+    """Return whether a file begins like a TIFF."""
     return head.startswith(_MAGIC)
 
 

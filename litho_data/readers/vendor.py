@@ -1,4 +1,4 @@
-"""Instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
+"""Read instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
 
 import re
 import struct
@@ -62,8 +62,8 @@ _UNTESTED = {
 }  # fmt: skip
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
-# Digital Surf's kinds of studiables that are not one surface (series, layers, pictures, curves, spectra), and
-# the position of the kind in the file.
+# Digital Surf's kinds of files that are not one surface (series, layers, pictures, curves, spectra), and the
+# position of the kind in the file.
 _NO_SURFACES, _SURFACE_KIND_AT = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 15, 20, 21), 18
 _IGOR_HEADERS = {1: 8 + 110, 2: 16 + 110, 3: 20 + 110, 5: 64 + 320}
 _IGOR_5_SIZES = "15I"
@@ -73,7 +73,7 @@ _LONGEST_HEADER = 1 << 20
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The two-dimensional channels of an instrument's file, in the order of the file.
+    """Read the two-dimensional channels of an instrument's file, in the order of the file.
 
     Raises:
         InputError: no reader recognises the file, it is damaged, or it holds no map.
@@ -92,7 +92,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """SurfaceTopography's names of the formats whose signature the file carries."""
+    """Return SurfaceTopography's names of the formats whose signature the file has."""
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
@@ -108,7 +108,9 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Whether the header has a version of Igor's waves and (except for the usual one) the right checksum."""
+    """Return whether the header has a version of Igor's waves and (except for the usual one) the right
+    checksum.
+    """
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
     size = _IGOR_HEADERS.get(version, 0)
@@ -117,7 +119,8 @@ def _is_igor(head: bytes) -> bool:
 
 
 def _recognise(path: Path) -> str:
-    """SurfaceTopography's name of the format: the first with the file's signature whose reader opens it.
+    """Return SurfaceTopography's name of the format: the first with the file's signature whose reader opens
+    the file.
 
     Raises:
         InputError: no signature is known, or no reader with that signature can read the file.
@@ -142,7 +145,9 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Refuse a wave shorter than its header says; igor2 trusts version 5 and would walk through gigabytes."""
+    """Refuse a wave shorter than its header says, because igor2 trusts version 5 and would walk through
+    gigabytes.
+    """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
         return
@@ -185,7 +190,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
 
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
-    """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
+    """Load heights with row 0 on top; SurfaceTopography indexes [x, y] with y downwards."""
     # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with foreign_parser(path, kind), _open(path, kind) as reader:
@@ -204,9 +209,9 @@ def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def _vendor_header(path: Path, kind: str) -> dict[str, str]:
-    """The header of an Igor wave or a Nanoscope file, word by word; empty for other formats.
+    """Read the header of an Igor wave or a Nanoscope file, word by word; empty for other formats.
 
-    SurfaceTopography passes these headers on only in part.
+    SurfaceTopography passes on only parts of these headers.
     """
     if kind == "ibw":
         return _igor_note(path)
@@ -214,9 +219,9 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 
 
 def _fast_axis(header: dict[str, str]) -> Axis | None:
-    """``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
+    """Return ``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
 
-    At other angles the lines of the file may follow the scanner or the scan; the caller has to know.
+    At other angles the lines of the file may follow the scanner or the scan, so the caller has to know.
     """
     try:
         angle = float(header["ScanAngle"]) % 180
@@ -226,7 +231,9 @@ def _fast_axis(header: dict[str, str]) -> Axis | None:
 
 
 def _layer_names(path: Path, kind: str) -> list[str]:
-    """The labels of an Igor wave's layers: SurfaceTopography drops the label of a single one."""
+    """Read the labels of an Igor wave's layers, because SurfaceTopography drops the label of a single
+    layer.
+    """
     if kind != "ibw":
         return []
     return [label.decode("utf-8", errors="replace").strip("\0 ") for label in _igor_wave(path)["labels"][2]]
@@ -249,7 +256,7 @@ def _igor_note(path: Path) -> dict[str, str]:
 
 
 def _nanoscope_header(path: Path) -> dict[str, str]:
-    """``section/key`` for every entry; sections of one name are numbered."""
+    """Return ``section/key`` for every entry; sections with the same name are numbered."""
     with path.open("rb") as stream:
         raw = stream.read(_LONGEST_HEADER)
     text = raw[: max(raw.find(_NANOSCOPE_END), 0)].decode("latin-1")

@@ -1,4 +1,6 @@
-"""Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm, ``Bad`` where missing."""
+"""Read Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm; missing pixels are
+``Bad``.
+"""
 
 from pathlib import Path
 
@@ -17,7 +19,8 @@ _BAD = "Bad"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per block; the second flag of the first line says whether heights are in nm or in waves.
+    """Read one channel per block; the second flag of the first line says whether heights are in nm or in
+    waves.
 
     The format stores columns one after another, each from the bottom. A file with one line per row is read by
     rows.

@@ -1,4 +1,4 @@
-"""Typed, checked access to Zarr groups and arrays; damaged bytes become one clear error."""
+"""Access Zarr groups and arrays with types and checks; damaged bytes become one clear error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def open_root(path: str | Path) -> zarr.Group:
-    """The root group of a store, read-only, without trusting consolidated metadata.
+    """Open the root group of a store, read-only, without trusting consolidated metadata.
 
     Raises:
         InputError: no such path, or not a Zarr v3 group.
@@ -43,7 +43,7 @@ def open_root(path: str | Path) -> zarr.Group:
 
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
-    """The child group of that name.
+    """Return the child group of that name.
 
     Raises:
         InputError: there is none.
@@ -54,7 +54,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
 
 
 def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
-    """The child array of that name.
+    """Return the child array of that name.
 
     Raises:
         InputError: there is none.
@@ -65,7 +65,7 @@ def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
 
 
 def has_child(parent: zarr.Group, name: str) -> bool:
-    """Whether there is a child of that name.
+    """Return whether there is a child of that name.
 
     Raises:
         InputError: there is one, with damaged metadata.
@@ -74,7 +74,7 @@ def has_child(parent: zarr.Group, name: str) -> bool:
 
 
 def values_of(parent: zarr.Group, name: str) -> Array:
-    """All values of a child array.
+    """Return all values of a child array.
 
     Raises:
         InputError: no such array, or a stored chunk that does not decode.
@@ -83,7 +83,7 @@ def values_of(parent: zarr.Group, name: str) -> Array:
 
 
 def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
-    """A selection of an array.
+    """Read a selection of an array.
 
     Raises:
         InputError: a stored chunk that does not decode; the message names its array.
@@ -97,7 +97,7 @@ def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
 
 
 def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
-    """All child groups by name.
+    """Return all child groups by name.
 
     Raises:
         InputError: a child with damaged metadata.
@@ -108,7 +108,7 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
 
 
 def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """The one-dimensional arrays of a group as a table, with the column ``first`` in front.
+    """Read the one-dimensional arrays of a group as a table, with the column ``first`` in front.
 
     Raises:
         InputError: damaged metadata or chunks, or columns of different lengths.

@@ -1,4 +1,4 @@
-"""References to scans of a store, which other processes read instead of receiving the arrays."""
+"""Refer to scans of a store, so that other processes read them instead of receiving the arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.store.read import PrintedScan, Store, open_store
 
 @dataclass(frozen=True)
 class StoredScans:
-    """Some scans of a store: path of the store, hash of the dataset, ids of the scans."""
+    """Some scans of a store: the path of the store, the hash of the dataset, and the ids of the scans."""
 
     path: str
     sha256: str
@@ -19,11 +19,11 @@ class StoredScans:
 
     @classmethod
     def of(cls, store: Store, scans: Sequence[PrintedScan]) -> StoredScans:
-        """The reference to these scans."""
+        """Make the reference to these scans."""
         return cls(str(store.path), store.sha256, tuple(scan.id for scan in scans))
 
     def read(self) -> list[PrintedScan]:
-        """The scans.
+        """Read the scans.
 
         Raises:
             InputError: no store at the path, or one of another dataset.
@@ -38,5 +38,5 @@ class StoredScans:
         return [store.scan(scan_id) for scan_id in self.ids]
 
     def by_id(self) -> dict[str, PrintedScan]:
-        """The scans by their ids."""
+        """Return the scans by their ids."""
         return {scan.id: scan for scan in self.read()}

@@ -1,4 +1,4 @@
-"""A store is refused unless it has every file that it declares and every number is possible."""
+"""Refuse a store unless it has every file that it declares and every number is possible."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LEADS_OUT = re.compile(r"(^|/)\.\.(/|$)|[\\:\x00]")
 
 
 def require_complete(path: Path) -> None:
-    """Refuse a store that has lost a file: zarr would read zeros or NaN in its place.
+    """Refuse a store that has lost a file, because zarr would read zeros or NaN in its place.
 
     Raises:
         InputError: names the first missing file.
@@ -62,7 +62,7 @@ def require_complete(path: Path) -> None:
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Names of files that a store declares but lacks: documents of groups and arrays, and chunks."""
+    """Yield the files that a store declares but lacks: documents of groups and arrays, and chunks."""
     names = file_names(path)
     with damaged(f"metadata of {path}"):
         documents = {name: json.loads(content) for name, content in read_documents(path, names)}
@@ -80,24 +80,24 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Mapping[str, Any]) -> bool:
-    """Whether a copy by xarray, which has no groups, may lack the chunk of this array.
+    """Return whether a copy by xarray, which has no groups, may lack the chunk of this array.
 
-    It writes no chunk that holds only fill values, such as order 0 of a single scan, or a column that no scan
-    of a part states.
+    xarray writes no chunk that contains only fill values, such as order 0 of a single scan, or a column that
+    no scan of a part states.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
 
 
 def file_names(path: Path) -> set[str]:
-    """Names of all files of a store, a folder or a zip file, with forward slashes.
+    """Return the names of all files of a store, a folder or a zip file, with forward slashes.
 
     Raises:
         InputError: a zip file with a name that leads out of it.
     """
     if path.is_dir():
         found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
-        # A dangling link is no file.
+        # A dangling link does not count as a file.
         return {file.relative_to(path).as_posix() for file in found if file.is_file()}
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
@@ -108,7 +108,7 @@ def file_names(path: Path) -> set[str]:
 
 
 def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
-    """The metadata documents among the files of a store, by name."""
+    """Yield the metadata documents among the files of a store, by name."""
     wanted = sorted(name for name in names if name.split("/")[-1] == _DOCUMENT)
     if path.is_dir():
         yield from ((name, (path / name).read_bytes()) for name in wanted)
@@ -118,7 +118,7 @@ def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
 
 
 def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
-    """Names of the files of an array, below its folder."""
+    """Yield the names of the files of an array, relative to its folder."""
     sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
     encoding = document["chunk_key_encoding"]
     with_c = encoding["name"] == "default"
@@ -135,7 +135,9 @@ def _by_xarray(attributes: Mapping[str, Any]) -> bool:
 
 
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
+    """Return name, pitch, level height, number of levels and write table of a store; raise InputError if one
+    is wrong.
+    """
     attributes = dict(root.attrs)
     name = str(attributes.get("name", path.name.partition(".")[0]))
     write = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
@@ -155,7 +157,9 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """The arrays over all scans by name; InputError if one is missing or has another shape, type or order."""
+    """Return the arrays over all scans by name; raise InputError if one is missing or has another shape, type
+    or order.
+    """
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -177,9 +181,9 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copy whose pixels are not those of the layouts, by the coordinates that it carries.
+    """Refuse a copy whose coordinates show that its pixels are not those of the layouts.
 
-    Positions in the store, such as the transforms of the scans, count from the first pixel.
+    Positions in the store, such as the transforms of the scans, are counted from the first pixel.
 
     Raises:
         InputError: rows or columns were left out or reversed.
@@ -235,7 +239,9 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """(ny, nx) of every scan without padding; InputError if one does not fit into the padded field."""
+    """Return (ny, nx) of every scan without padding; raise InputError if one does not fit into the padded
+    field.
+    """
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
     quality = group_of(root, "quality")
@@ -271,7 +277,8 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 
 
 def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
-    """Refuse a manifest that lacks what its readers need; a manifest with only a table is not from a build.
+    """Refuse a manifest that lacks what its readers need; a manifest with only a table does not come from a
+    build.
 
     Raises:
         InputError: names the first entry that is missing or of another kind.

@@ -1,4 +1,4 @@
-"""The lock box: scans of a dataset that no choice of a model or an effect may use.
+"""Choose the lock box: scans of a dataset that no choice of a model or an effect may use.
 
 The choice follows from a hash of the ids, not from a library's random generator, so the same ids always give
 the same lock box.
@@ -12,7 +12,7 @@ from litho_data.foundation.errors import InputError
 
 
 class HasPrint(Protocol):
-    """The facts about a scan for the draw: its id and its print."""
+    """The facts about a scan on which the draw depends: its id and its print."""
 
     @property
     def id(self) -> str: ...
@@ -21,12 +21,12 @@ class HasPrint(Protocol):
 
 
 def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
-    """The lock box of a dataset; takes all of its scans."""
+    """Choose the lock box of a dataset from all of its scans."""
     return lock_box([scan.id for scan in scans], [scan.print_id for scan in scans])
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """A sixth of the scans, at least one, from different prints if possible; empty for one or two scans.
+    """Choose a sixth of the scans, at least one, from different prints if possible; none of one or two scans.
 
     Args:
         ids: scan ids; ``print_ids``: the print of each, same length.
@@ -49,7 +49,9 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
 
 
 def drawing_key(name: str, seed: int) -> str:
-    """A key to sort names by; the order is the same on every machine and differs between seeds."""
+    """Return a key by which to sort names; the order is the same on every machine and differs between
+    seeds.
+    """
     return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
 
@@ -65,5 +67,5 @@ def require_unique(ids: Sequence[str]) -> None:
 
 
 def ids_sha256(ids: Sequence[str]) -> str:
-    """Hex SHA-256 of a set of ids: sorted, one per line."""
+    """Return the hex SHA-256 of a set of ids: sorted, one per line."""
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()

@@ -1,8 +1,8 @@
 """A store under construction, which keeps finished scans so that an interrupted build resumes.
 
-It lies beside the store as ``.<name>.partial`` and becomes the store in one rename. A scan is finished when
-its record exists, which is written last. It is reused only if its files, parameters and code are the same and
-its arrays still have the recorded hashes.
+Its folder ``.<name>.partial`` lies beside the store, and becomes the store by being renamed. A scan is
+finished when its record exists, which is written last. A scan is reused only if its files, parameters and
+code are the same and its arrays still have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class Piece:
 
 
 def outputs_of(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The outputs of the steps of a scan's record: name, hash, shape, …"""
+    """Return the outputs of the steps of a scan's record: name, hash, shape, …"""
     return [output for step in record["steps"] for output in step["outputs"]]
 
 
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
-    """The unfinished store of ``out``; only one process at a time may use it.
+    """Yield the unfinished store of ``out``, which only one process at a time may use.
 
     Raises:
         InputError: ``out`` exists and is not a dataset store, cannot be written, or is being built already.
@@ -55,7 +55,7 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
 
 
 class PartialStore:
-    """Pieces on disk and the group that they grow into."""
+    """The finished scans on disk, and the group into which they grow."""
 
     def __init__(self, out: Path, folder: Path):
         self.out = out
@@ -64,7 +64,7 @@ class PartialStore:
         self._pieces = self.folder / "pieces"
 
     def open(self) -> zarr.Group:
-        """The growing root group; everything except finished scans is removed first."""
+        """Return the growing root group, after removing everything except finished scans."""
         import zarr
 
         self._pieces.mkdir(exist_ok=True)
@@ -73,12 +73,12 @@ class PartialStore:
                 if child.name != "scans":
                     shutil.rmtree(child) if child.is_dir() else child.unlink()
         root = zarr.open_group(self.store, mode="a", zarr_format=3)
-        # It exists already, because several processes add to it.
+        # The group must already exist, because several processes add to it.
         root.require_group("scans")
         return root
 
     def finished(self, root: zarr.Group, keys: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """Records of the scans that need not be computed again.
+        """Return the records of the scans that need not be computed again.
 
         Args:
             root: the growing group.
@@ -99,7 +99,7 @@ class PartialStore:
         return records
 
     def add(self, piece: Piece) -> None:
-        """Keep one finished scan, in any process; its record is written last."""
+        """Store one finished scan, from any process; its record is written last."""
         import zarr
 
         scan_id = piece.record["id"]
@@ -113,12 +113,12 @@ class PartialStore:
             temporary.write_text(json.dumps(piece.record), encoding="utf-8")
 
     def samples(self, scan_id: str) -> dict[str, Array]:
-        """The arrays of one finished scan on the layout grid."""
+        """Return the arrays of one finished scan on the layout grid."""
         with np.load(self._pieces / f"{scan_id}.npz", allow_pickle=False) as archive:
             return dict(archive)
 
     def publish(self) -> None:
-        """Move the finished store to its path, where it replaces an older one."""
+        """Move the finished store to its path, where it replaces an older store."""
         publish(self.store, self.out)
         self.discard()
 

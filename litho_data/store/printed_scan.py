@@ -81,28 +81,30 @@ class PrintedScan:
 
     @property
     def quarter_turns(self) -> int:
-        """Number of ``rot90`` turns, 0 to 3, from the layout's grid to the scan's, by its registration."""
+        """Return the number of ``rot90`` turns, 0 to 3, from the layout's grid to the scan's, by its
+        registration.
+        """
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
     @property
     def usable(self) -> Array:
-        """Measured pixels, bool (ny, nx)."""
+        """Return a mask of the measured pixels, bool (ny, nx)."""
         return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
 
     @property
     def layout_um(self) -> Array:
-        """Nominal height, float32 (ny, nx), µm."""
+        """Return the nominal height, float32 (ny, nx), µm."""
         return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(ny, nx) in pixels."""
+        """Return (ny, nx) in pixels."""
         return self.mask_level.shape[0], self.mask_level.shape[1]
 
 
 def scan_sha256(scan: PrintedScan) -> str:
-    """The one key of a scan, for caches, resumed work and dataset ids: the hash of all its fields."""
+    """Return the one key of a scan, for caches, resumed work and dataset ids: the hash of all its fields."""
     return record_sha256(_hashed(scan))
 
 

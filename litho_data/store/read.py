@@ -1,4 +1,4 @@
-"""Reading a dataset store: checked once when it is opened, then read one scan at a time."""
+"""Read a dataset store: it is checked once when it is opened, then read one scan at a time."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Store:
         return f"<p>{html.escape(repr(self))}</p>{scans.to_html(index=False, max_rows=_SHOWN_SCANS)}"
 
     def scan(self, scan_id: str) -> PrintedScan:
-        """One scan, without padding.
+        """Return one scan without padding.
 
         Raises:
             InputError: no such id, or a stored chunk that does not decode.
@@ -135,9 +135,11 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """The groups that the card's pattern for ids names, with their values in one id; without the print.
+        """Return the groups that the card's pattern for ids names, except the print, with their values in one
+        id.
 
-        A pattern with repetitions is not applied, because one in a store from elsewhere might never finish.
+        A pattern with repetitions is not applied, because a pattern in a store from elsewhere might never
+        finish.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -151,11 +153,11 @@ class Store:
         return {name: value for name, value in found.items() if name != "print" and value is not None}
 
     def scans(self) -> list[PrintedScan]:
-        """All scans in stored order, in memory."""
+        """Return all scans in stored order, in memory."""
         return [self.scan(scan_id) for scan_id in self.ids]
 
     def sample(self, name: str, row: int) -> Array:
-        """One scan's slice of one array in its true shape.
+        """Return one scan's slice of one array in the scan's true shape.
 
         Raises:
             InputError: a stored chunk that does not decode.
@@ -168,7 +170,8 @@ class Store:
         return values[:ny, :nx]
 
     def scan_frame(self, scan_id: str, name: str) -> Array:
-        """An array of a scan in its own frame: ``raw_height_um``, ``levelled_height_um``, ``removed_um``, …
+        """Return an array of a scan in its own frame: ``raw_height_um``, ``levelled_height_um``,
+        ``removed_um``, …
 
         Raises:
             InputError: no such scan or array, or a stored chunk that does not decode.
@@ -177,13 +180,13 @@ class Store:
 
     @property
     def locked_ids(self) -> list[str]:
-        """Ids of the lock box: a sixth of the scans, from different prints, always the same."""
+        """Return the ids of the lock box: a sixth of the scans, from different prints, always the same."""
         return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Hash of the raw file of each scan, independent of levelling and registration.
+        """Return the hash of the raw file of each scan, independent of levelling and registration.
 
-        A scan whose file the store does not list is left out. Layouts are not hashed, because one may be
+        A scan is left out if the store does not list its file. Layouts are not hashed, because one may be
         printed twice.
         """
         wanted = set(ids)
@@ -192,7 +195,9 @@ class Store:
         return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
-        """Scans outside the dataset: id and use, such as flat; ``scan_frame`` has the heights."""
+        """Return the scans outside the dataset: id and use, such as flat; ``scan_frame`` reads their
+        heights.
+        """
         if not has_child(self.root, "scans"):
             return {}
         groups = groups_in(group_of(self.root, "scans"))
@@ -201,7 +206,7 @@ class Store:
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     def recorded_pitches_um(self) -> dict[str, YX]:
-        """Pitch (y, x) of the scans, including references, as their reader recorded it."""
+        """Return the pitch (y, x) of the scans, including references, as their reader recorded it."""
         pitches = {}
         for row in self.manifest.get("files", []):
             if pitch := _read_facts(row).get("pitch_um"):
@@ -210,7 +215,9 @@ class Store:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """Card, build record and one row per raw file; empty for a store that was not built from a card."""
+        """Return card, build record and one row per raw file; empty for a store that was not built from a
+        card.
+        """
         if not has_child(self.root, "manifest"):
             return {}
         group = group_of(self.root, "manifest")
@@ -220,7 +227,9 @@ class Store:
 
     @cached_property
     def quality(self) -> pd.DataFrame:
-        """One row per scan: registration, levelling and noise figures; only the ids if none are stored."""
+        """Return one row per scan with registration, levelling and noise figures; only the ids if none are
+        stored.
+        """
         import pandas as pd
 
         if not has_child(self.root, "quality"):
@@ -229,16 +238,16 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the dataset as it was read, independent of chunking."""
+        """Return the hash of the dataset as it was read, independent of chunking."""
         return self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:
-        """Name and hash, for results made from this dataset."""
+        """Return name and hash, for results made from this dataset."""
         return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:
-        """Hash of the dataset, computed from the arrays as they are now."""
+        """Compute the hash of the dataset from the arrays as they are now."""
         facts = dataset_facts(self, self.instrument, self.write)
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
 
@@ -262,7 +271,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """The bend of a scan in its own frame; None if none is stored."""
+        """Return the bend of a scan in its own frame; None if none is stored."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

@@ -13,7 +13,7 @@ from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
 WRITE = "write_"
-"""Prefix of the root attributes that hold the card's ``[write]`` table."""
+"""Prefix of the root attributes that contain the card's ``[write]`` table."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,18 @@ class Variable:
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
-        """The dimensions of one scan's slice."""
+        """Return the dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
     def sample_sha256(self, sample: Array) -> str:
-        """Hash of one scan's slice in its true shape, so padding and chunking do not matter."""
+        """Return the hash of one scan's slice in its true shape, so that padding and chunking do not
+        matter.
+        """
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
 
 
 class DatasetId(Record):
-    """Which dataset a result is about: its name, and the hash of what a model can see of it."""
+    """The dataset to which a result refers: its name, and the hash of what a model can see of it."""
 
     name: str
     sha256: str
@@ -98,7 +100,7 @@ TEXT_COLUMNS = ("instrument", "surround")
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Facts about all scans, as part of the dataset's hash.
+    """Return facts about all scans, as part of the dataset's hash.
 
     Args:
         geometry: has ``pitch_um``, ``level_height_um`` and ``levels``; ``write``: the card's table.
@@ -109,7 +111,8 @@ def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | Non
 
 
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
-    """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
+    """Return the hash of what a model can see of a dataset, independent of chunking, padding and metadata
+    texts.
 
     Args:
         facts: see ``dataset_facts``.

@@ -1,4 +1,4 @@
-"""Writing a dataset store: one scan per chunk, as other tools copy it; every chunk has a checksum."""
+"""Write a dataset store: one scan per chunk, as other tools copy it; every chunk has a checksum."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write the group ``scans/<id>``, one scan in its own frame; it is also an image of OME-Zarr.
+    """Write the group ``scans/<id>``, one scan in its own frame, which is also an image of OME-Zarr.
 
     Args:
         root: an open group.
@@ -53,7 +53,9 @@ def write_scan_group(
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
-    """OME-NGFF 0.5: one image of heights, its pixel size, and axes named as the dimensions of the array."""
+    """Describe an image by OME-NGFF 0.5: heights, pixel size, and axes named as the dimensions of the
+    array.
+    """
     axes = [{"name": _OWN_FRAME[axis], "type": "space", "unit": "micrometer"} for axis in "yx"]
     scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
     dataset = {"path": path, "coordinateTransformations": scale}
@@ -109,14 +111,16 @@ def write_samples(
 
 
 def pixel_centres_um(count: int, pitch_um: float) -> Array:
-    """Coordinates of pixel centres along one axis, µm."""
+    """Return the coordinates of pixel centres along one axis, µm."""
     return (np.arange(count) + 0.5) * pitch_um
 
 
 def write_table(
     root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict[str, Any] | None = None
 ) -> None:
-    """A table as a group of one-dimensional arrays over ``dim``; text as UTF-8, no missing text."""
+    """Write a table as a group of one-dimensional arrays over ``dim``; text is UTF-8, and no text is
+    missing.
+    """
     group = root.create_group(name, attributes=attributes or {})
     for column in table.columns:
         values = table[column].to_numpy()
@@ -145,9 +149,9 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
 
 
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
-    """A new array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unseen.
+    """Create an array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unnoticed.
 
-    By default a chunk of fill values only has no file, and would look like a lost one.
+    By default a chunk that contains only fill values has no file, and would look like a lost chunk.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -160,7 +164,7 @@ def consolidate(root: zarr.Group) -> None:
     import zarr
 
     with warnings.catch_warnings():
-        # zarr-python warns that other readers may not know the copy; these read the single documents.
+        # zarr-python warns that other readers may not know the copy; such readers use the single documents.
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(root.store)
 
@@ -187,7 +191,7 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
 
 
 def _padded(name: str, sample: Array, shape: Shape) -> Array:
-    """A sample in the upper left corner of the common shape; ``PADDING`` elsewhere."""
+    """Place a sample in the upper left corner of the common shape, with ``PADDING`` elsewhere."""
     if sample.shape == shape:
         return sample
     whole = np.full(shape, PADDING[name], dtype=VARIABLES[name].dtype)

@@ -1,4 +1,4 @@
-"""The microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
+"""Simulate the microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
 
 import numpy as np
 import scipy.ndimage
@@ -21,7 +21,7 @@ def scan_surface(
     job: Job,
     rng: np.random.Generator,
 ) -> Array:
-    """Height that the microscope reports for a surface given at its pixels, µm.
+    """Return the height that the microscope reports for a surface given at its pixels, µm.
 
     Lines are scanned from left to right (fast axis x; from right to left in retrace), the first line on top.
     With smaller pixels the tip moves more slowly, so a lag in time becomes a shorter length.
@@ -59,7 +59,9 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``, also between pixels."""
+    """Return the path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``, also between
+    pixels.
+    """
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
     return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
@@ -69,7 +71,7 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
     from scipy.interpolate import CubicSpline
 
     fine_um = pitch_um / _TIP_OVERSAMPLING
-    # The tip touches where its slope u/R equals the surface's.
+    # The tip touches where its slope u/R equals that of the surface.
     steepest = np.abs(np.diff(height, axis=0)).max() / pitch_um
     reach = int(np.ceil(1.5 * radius_um * steepest / fine_um)) + 1
     rows = height.shape[0]
@@ -84,7 +86,7 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
 
 
 def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
-    """First-order feedback along the lines, which loses the surface more easily on falling edges."""
+    """Apply first-order feedback along the lines, which loses the surface more easily on falling edges."""
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
     at = height[:, 0].copy()
@@ -99,7 +101,7 @@ def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> Array:
-    """The sum of all contributions that do not depend on the surface, nm."""
+    """Sum all contributions that do not depend on the surface, nm."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)
@@ -126,7 +128,7 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Scars along the fast axis and single-pixel spikes, of either sign."""
+    """Add scars along the fast axis and single-pixel spikes, of either sign."""
     scarred = height.copy()
     ny, nx = height.shape
     for _ in range(rng.poisson(scars_per_row * ny)):

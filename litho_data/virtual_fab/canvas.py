@@ -1,4 +1,4 @@
-"""The area that is simulated around one layout, and spectral blurs on it."""
+"""The area that is simulated around one layout, and spectral blurs on this area."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ GUARD_PX = 96
 
 @dataclass(frozen=True)
 class Canvas:
-    """A layout with a guard frame, and where it lies in its write field.
+    """A layout with a guard frame, and its position in the write field.
 
     Args:
         level: uint8, (ny + 2·GUARD_PX, nx + 2·GUARD_PX); the layout sits in the middle.
@@ -28,22 +28,22 @@ class Canvas:
 
     @property
     def y_um(self) -> Array:
-        """Row centres in the layout's frame, µm, as a column (ny, 1)."""
+        """Return the row centres in the layout's frame, µm, as a column (ny, 1)."""
         return ((np.arange(self.level.shape[0]) - GUARD_PX + 0.5) * self.pitch_um)[:, None]
 
     @property
     def x_um(self) -> Array:
-        """Column centres in the layout's frame, µm, as a row (1, nx)."""
+        """Return the column centres in the layout's frame, µm, as a row (1, nx)."""
         return ((np.arange(self.level.shape[1]) - GUARD_PX + 0.5) * self.pitch_um)[None, :]
 
     @property
     def size_um(self) -> YX:
-        """(y, x) extent of the layout, µm."""
+        """Return (y, x) extent of the layout, µm."""
         ny, nx = self.level.shape
         return (ny - 2 * GUARD_PX) * self.pitch_um, (nx - 2 * GUARD_PX) * self.pitch_um
 
     def field_offset_um(self) -> tuple[Array, Array]:
-        """(y, x) distance of every pixel from the write field's centre, µm, broadcastable."""
+        """Return the (y, x) distance of every pixel from the write field's centre, µm, broadcastable."""
         height_um, width_um = self.size_um
         return self.y_um - height_um / 2 + self.field_um[0], self.x_um - width_um / 2 + self.field_um[1]
 
@@ -54,19 +54,19 @@ def frame_layout(level: Array) -> Array:
 
 
 def cut_layout(array: Array) -> Array:
-    """The part of a canvas array that belongs to the layout."""
+    """Cut out the part of a canvas array that belongs to the layout."""
     return array[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX]
 
 
 def set_layout(array: Array, inner: Array) -> Array:
-    """A copy of a canvas array with another middle part."""
+    """Copy a canvas array with another middle part."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed
 
 
 def frequencies_per_um(shape: Shape, pitch_um: float) -> tuple[Array, Array]:
-    """(fy, fx) of the half-plane transform, cycles per µm, broadcastable."""
+    """Return (fy, fx) of the half-plane transform, cycles per µm, broadcastable."""
     return np.fft.fftfreq(shape[0], pitch_um)[:, None], np.fft.rfftfreq(shape[1], pitch_um)[None, :]
 
 
@@ -76,11 +76,11 @@ def apply_transfer(field: Array, transfer: Array) -> Array:
 
 
 def gaussian_transfer(shape: Shape, pitch_um: float, sigma_um: float) -> Array:
-    """Transfer function of an isotropic Gaussian of sd ``sigma_um``."""
+    """Return the transfer function of an isotropic Gaussian of sd ``sigma_um``."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     return np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
 
 
 def blur(field: Array, pitch_um: float, sigma_um: float) -> Array:
-    """Gaussian blur of sd ``sigma_um``."""
+    """Return the Gaussian blur of sd ``sigma_um``."""
     return apply_transfer(field, gaussian_transfer(field.shape, pitch_um, sigma_um))

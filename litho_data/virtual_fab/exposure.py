@@ -1,4 +1,6 @@
-"""Exposure: hatch lines, slices and two-photon dose, with the effects of beam, galvo and field."""
+"""Simulate the exposure: hatch lines, slices and two-photon dose, with the effects of beam, galvo and
+field.
+"""
 
 import numpy as np
 import scipy.ndimage
@@ -31,11 +33,11 @@ def accumulate_dose(
     order: float = 0.0,
     scan_index: int = 0,
 ) -> Array:
-    """Two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
+    """Return the two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
 
-    Each row of the canvas is one hatch line. In slice k the laser is on wherever the level is at
-    least k, and absorption is proportional to the squared intensity of the spot, so the slices add up to
-    ``level * (squared spot)``.
+    Each row of the canvas is one hatch line. In slice k the laser is on wherever the level is at least k.
+    Absorption is proportional to the squared intensity of the spot, so the slices add up to ``level *
+    (squared spot)``.
 
     Args:
         canvas: what is written.
@@ -85,10 +87,10 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Exposure with every point of a hatch line at x + strength·x(1 − x/L), 0 ≤ x ≤ L the write field."""
+    """Expose every point of a hatch line at x + strength·x(1 − x/L), where 0 ≤ x ≤ L is the write field."""
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point that is written here: the root of x + strength·x(1 − x/L) = at that vanishes at 0.
+    # The point that is written here is the root of x + strength·x(1 − x/L) = at that vanishes at 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
@@ -99,12 +101,14 @@ def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:
-    """First canvas pixel of each write field along one axis; the outermost fields include the guard frame."""
+    """Return the first canvas pixel of each write field along one axis; the outermost fields include the
+    guard frame.
+    """
     return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Exposure (ny, nx) written field by field, each field displaced; doses add up where fields overlap.
+    """Expose (ny, nx) field by field, with each field displaced; doses add up where fields overlap.
 
     Args:
         starts: first row, and first column, of every field.
@@ -122,7 +126,7 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
 
 
 def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
-    """Relative dose over the write field."""
+    """Return the relative dose over the write field."""
     if not (strength := knobs["vignetting"]):
         return 1.0
     y_um, x_um = canvas.field_offset_um()
@@ -131,7 +135,9 @@ def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
 
 
 def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Transfer function of the squared spot, with its ellipticity, its ghost and the lag of the galvo."""
+    """Return the transfer function of the squared spot, with its ellipticity, its ghost and the lag of the
+    galvo.
+    """
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
     # The square of a Gaussian intensity is a Gaussian narrower by √2.
     sigma_um = printer.spot_sigma_um / 2**0.5
@@ -151,7 +157,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Effective dose if every slice has to pass the threshold by itself."""
+    """Compute the effective dose if every slice has to pass the threshold by itself."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):
@@ -162,12 +168,12 @@ def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, pri
 
 
 def _soft_step(dose: Array) -> Array:
-    """Logistic step that maps 0 to 0 and 1 to 1 exactly."""
+    """Apply a logistic step that maps 0 to 0 and 1 to 1 exactly."""
     low, high = (1 / (1 + np.exp(-_SLICE_STEEPNESS * (edge - _SLICE_THRESHOLD))) for edge in (0.0, 1.0))
     return (1 / (1 + np.exp(-_SLICE_STEEPNESS * (dose - _SLICE_THRESHOLD))) - low) / (high - low)
 
 
 def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
-    """Exponentially fading mean of the lines above, which were written before."""
+    """Return the exponentially fading mean of the lines above, which were written before."""
     memory = np.exp(-pitch_um / decay_um)
     return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

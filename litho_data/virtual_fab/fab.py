@@ -1,4 +1,4 @@
-"""The fab: a printer, a microscope, their knobs and their noise; one field in, one scan out."""
+"""The fab: a printer and a microscope with their knobs and noise; a field goes in, a scan comes out."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs, their noise, and a cause that is no knob."""
+    """A printer and a microscope with their knobs, their noise, and a cause that is not a knob."""
 
     printer: Printer
     microscope: Microscope
@@ -46,7 +46,7 @@ class FabScan:
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
-    """Print and scan one field; depends on the fab and the job only, not on other fields."""
+    """Print and scan one field; the result depends only on the fab and the job, not on other fields."""
     geometry_seed, _, instrument_seed = _seeds(fab, job.index)
     roughness_seed = _seeds(fab, job.printed)[1]
     frame = place_scan(
@@ -78,5 +78,5 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Seeds of the scan's position, of the surface's roughness and of the microscope's noise."""
+    """Return the seeds of the scan's position, of the surface's roughness and of the microscope's noise."""
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

@@ -1,4 +1,5 @@
-"""A fab for films written by an electron beam or through a lens, etched and seen in an electron microscope.
+"""A fab for films that are written by an electron beam or through a lens, etched, and seen in an electron
+microscope.
 
 It shares no code with the models: scattering is a product of spectra, a lens sums the images of the points of
 its source, and etching shifts the distance from an edge.
@@ -49,7 +50,7 @@ surround = "unknown"
 
 @dataclass(frozen=True)
 class FilmKnobs:
-    """Effects of a process beyond plain printing; lengths in µm.
+    """Effects of a process beyond plain printing; lengths are in µm.
 
     Attributes:
         backscatter: electrons (or stray light) scattered back, relative to the dose; ``backscatter_um``:
@@ -71,7 +72,7 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine: process, sampling, film, beam (sd) or lens, relative resist threshold."""
+    """A machine: process, sampling, film, beam (sd) or lens, and relative resist threshold."""
 
     process: Literal["e-beam", "projection"]
     pitch_um: float
@@ -90,7 +91,9 @@ FILM_PRINTERS = {
 
 
 class FilmTruth(Result):
-    """``films.json``; the distances of the edges of each film lie beside it, ``<id>.npy``, layout pixels."""
+    """The record ``films.json``; the distances of the edges of each film are beside it in ``<id>.npy``,
+    layout pixels.
+    """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
     FILE_NAME: ClassVar[str] = "films.json"
@@ -103,7 +106,7 @@ class FilmTruth(Result):
 
 
 def film_knobs(words: Iterable[str]) -> FilmKnobs:
-    """Knobs from words ``name=value``.
+    """Make knobs from words ``name=value``.
 
     Raises:
         InputError: an unknown name, or a value that is no number.
@@ -119,7 +122,8 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Distance from the film's edge, positive on the film, at 4 × 4 places per pixel of a binary layout.
+    """Return the distance from the film's edge, positive on the film, at 4 × 4 places per pixel of a binary
+    layout.
 
     The layout is periodic; distances are in pixels of the layout.
     """
@@ -145,7 +149,7 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
 
 
 def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
-    """What an electron microscope shows of an edge, uint8: bright rims, charging along x, noise."""
+    """Return what an electron microscope shows of an edge, uint8: bright rims, charging along x, noise."""
     film = 1 / (1 + np.exp(-_FINER * distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(_FINER * distance_px, 0) / 12))
     grey = grey * (1 + knobs.charging * np.linspace(-1, 1, distance_px.shape[1]))
@@ -161,12 +165,13 @@ def simulate_films(
     seed: int = 0,
     knobs: FilmKnobs = FilmKnobs(),
 ) -> Path:
-    """Print films of random layouts and take their micrographs; returns the path of the card.
+    """Print films of random layouts and take their micrographs; return the path of the card.
 
-    ``out/raw`` is what a laboratory would deliver; ``out/truth`` has knobs and distances of the edges.
+    ``out/raw`` contains what a laboratory would deliver; ``out/truth`` contains knobs and distances of the
+    edges.
 
     Raises:
-        InputError: no such process, or a folder with something else in it.
+        InputError: no such process, or a folder that contains files of another kind.
     """
     import cv2
 
@@ -195,7 +200,9 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """A random layout, uint8 (ny, nx) of 0 and 1, of features that the process resolves; a third are fine."""
+    """Make a random layout, uint8 (ny, nx) of 0 and 1, with features that the process resolves; a third are
+    fine.
+    """
     lens_um = 0.25 * printer.wavelength_um / printer.na
     smallest_um = printer.spot_um if printer.process == "e-beam" else lens_um
     cutoff_per_um = 1 / (smallest_um * (7 - finer))
@@ -205,7 +212,9 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
-    """Intensity behind a mask, 1 if it is open: the mean of the images from the points of a round source."""
+    """Return the intensity behind a mask, 1 if it is open: the mean of the images from the points of a round
+    source.
+    """
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)
     sides = np.linspace(-1, 1, _SOURCE_POINTS)

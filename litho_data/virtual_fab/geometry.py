@@ -1,4 +1,4 @@
-"""Where the pixels of a scan lie on the print."""
+"""Find where the pixels of a scan lie on the print."""
 
 from dataclasses import dataclass
 
@@ -31,12 +31,12 @@ class ScanFrame:
 
     @property
     def size_um(self) -> YX:
-        """(y, x) nominal extent, µm."""
+        """Return (y, x) nominal extent, µm."""
         return self.shape[0] * self.pitch_um, self.shape[1] * self.pitch_um
 
     @property
     def unit_axes(self) -> tuple[Array, Array]:
-        """(y, x) coordinates from −1 to 1 over the scan, broadcastable."""
+        """Return (y, x) coordinates from −1 to 1 over the scan, broadcastable."""
         return np.linspace(-1, 1, self.shape[0])[:, None], np.linspace(-1, 1, self.shape[1])[None, :]
 
 
@@ -48,10 +48,10 @@ def place_scan(
     turned_deg: float = 0.0,
     pixel_size: float = 1.0,
 ) -> ScanFrame:
-    """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale.
+    """Place a scan centred on the layout, up to a small random shift, rotation, shear and anisotropic scale.
 
-    ``turned_deg``: rotation of the print under the microscope, in addition to the small rotation;
-    ``pixel_size``: pixel size of the scan, in pixels of the layout.
+    ``turned_deg`` is the rotation of the print under the microscope, in addition to the small rotation;
+    ``pixel_size`` is the pixel size of the scan, in pixels of the layout.
     """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
@@ -74,7 +74,7 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
+    """Sample the surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
     # In retrace a piezo bends the other way.
@@ -93,7 +93,7 @@ def sample_surface(
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
-    """Random second-order polynomial without its affine part, unit rms on average."""
+    """Draw a random second-order polynomial without its affine part, with unit rms on average."""
     y, x = frame.unit_axes
     c = rng.standard_normal(3)
     # Legendre terms and the product have variances 1/5, 1/5 and 1/9 over the square.

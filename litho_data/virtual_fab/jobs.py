@@ -56,18 +56,18 @@ class Plan:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
 
     def scan_id(self, block: int, field: int) -> str:
-        """Name of a field; padded, so that the sorted names are in print order."""
+        """Return the name of a field, padded so that the sorted names are in print order."""
         blocks = -(-self.count // self.fields_per_print)
         return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
 
     @property
     def total(self) -> int:
-        """Number of scans, including references."""
+        """Return the number of scans, including references."""
         return self.count + 3 * self.references
 
 
 def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
-    """The fields of a plan in print order; each depends only on the seed and its own number."""
+    """Yield the fields of a plan in print order; each depends only on the seed and its own number."""
     for index in range(plan.count):
         block, field = divmod(index, plan.fields_per_print)
         yield Job(
@@ -89,7 +89,7 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
 
 
 def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
-    """(y, x) centre of a field in the shared write field: a square block, row by row."""
+    """Return (y, x) centre of a field in the shared write field: a square block, row by row."""
     if plan.write_field_um is None:
         return 0.0, 0.0
     side = int(np.ceil(plan.fields_per_print**0.5))
@@ -105,7 +105,7 @@ def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
 
 
 def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
-    """A bare substrate, a flat print of the middle level, and steps of one level each."""
+    """Yield a bare substrate, a flat print of the middle level, and steps of one level each."""
     middle = (printer.levels - 1) // 2
     flat = np.full(plan.size_px, middle, np.uint8)
     stairs = np.arange(plan.size_px[1]) * _STEPS // plan.size_px[1] + 1
@@ -116,10 +116,10 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Jobs for the layouts of a dataset card, printed and scanned as its table says.
+    """Make jobs for the layouts of a dataset card, printed and scanned as its table says.
 
-    Rows of one print with the same layout are scans of one printed field if the table says how a scan was
-    made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``).
+    If the table says how a scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``), rows of
+    one print with the same layout are scans of one printed field.
 
     Args:
         path: the card.

@@ -1,4 +1,4 @@
-"""Every effect beyond plain printing: name, unit, range, and its name in the catalogue of effects."""
+"""Every effect beyond plain printing: its name, unit, range, and name in the catalogue of effects."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """The largest strength as text, without a unit if that is 1."""
+        """Return the largest strength as text, without a unit if that is 1."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob set to a strength; without a seed of its own it uses that of the run."""
+    """A knob set to a strength; if it has no seed, it uses that of the run."""
 
     name: str
     strength: float
@@ -61,7 +61,7 @@ class KnobSetting:
 
     @classmethod
     def parse(cls, text: str) -> KnobSetting:
-        """``name=strength`` or ``name=strength@seed``.
+        """Parse ``name=strength`` or ``name=strength@seed``.
 
         Raises:
             InputError: another form, an unknown name, or a strength outside the knob's range.
@@ -79,7 +79,7 @@ class KnobSetting:
 
 
 def checked(setting: KnobSetting) -> KnobSetting:
-    """The setting itself, if its knob exists and its strength is within range."""
+    """Return the setting itself, if its knob exists and its strength is within range."""
     knob = KNOBS.get(setting.name)
     if knob is None:
         raise unknown_name("knob", setting.name, KNOBS, "`litho-data simulate --list-knobs` explains them")
@@ -106,15 +106,15 @@ class KnobBoard:
         return self._strength.get(KNOBS[name].name, 0.0)
 
     def any(self, *names: str) -> bool:
-        """Whether one of the knobs is not at zero."""
+        """Return whether one of the knobs is not at zero."""
         return any(self[name] for name in names)
 
     def machine_rng(self, name: str) -> np.random.Generator:
-        """The random generator of a knob for the machine: the same for every scan."""
+        """Return the random generator of a knob for the machine, which is the same for every scan."""
         return self._rng(name, 0)
 
     def scan_rng(self, name: str, scan_index: int) -> np.random.Generator:
-        """The random generator of a knob for one scan: new for every scan."""
+        """Return the random generator of a knob for one scan, which is new for every scan."""
         return self._rng(name, scan_index + 1)
 
     def _rng(self, name: str, stream: int) -> np.random.Generator:
@@ -125,4 +125,4 @@ KNOBS: dict[str, Knob] = {
     one["name"]: Knob(**one)
     for one in tomllib.loads(Path(__file__).with_name("knobs.toml").read_text(encoding="utf-8"))["knob"]
 }
-"""All knobs by name, in the order of the listing; the table is ``knobs.toml``."""
+"""All knobs by name, in the order of the listing; the table is in ``knobs.toml``."""

@@ -1,4 +1,4 @@
-"""One print from layout to dry surface."""
+"""Print one field, from layout to dry surface."""
 
 from dataclasses import dataclass
 
@@ -57,37 +57,39 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Number of the print, which decides its random draws; those of the scan depend on ``index``."""
+        """Return the number of the print, which decides its random draws; those of the scan depend on
+        ``index``.
+        """
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """The framed layout in its write field."""
+        """Return the framed layout in its write field."""
         side_um = self.write_field_um or max(self.level.shape) * pitch_um
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
 
 
 class Cause:
-    """An effect that is no knob, for experiments of your own; this base class changes nothing.
+    """An effect that is not a knob, for your own experiments; this base class changes nothing.
 
     A subclass overrides one or more stages. A stage may depend only on its arguments, because a field is
     printed and scanned more than once.
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
-        """The two-photon dose on the canvas, 1 = full, never negative."""
+        """Change the two-photon dose on the canvas, 1 = full, never negative."""
         return dose
 
     def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
-        """The dry surface on the canvas, without roughness, µm."""
+        """Change the dry surface on the canvas, without roughness, µm."""
         return surface_um
 
     def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
-        """The true surface at the pixels of the scan, before the microscope's own errors, µm."""
+        """Change the true surface at the pixels of the scan, before the microscope's own errors, µm."""
         return height_um
 
 
 def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> Array:
-    """Surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
+    """Return the surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
     cause = cause or Cause()
     canvas = job.canvas(printer.pitch_um)
     if job.use == "substrate":
@@ -109,7 +111,7 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
 
 
 def _bars(at_um: Array, period_um: float) -> Array:
-    """1 on bars of half a period, 0 between them, straight flanks."""
+    """Return 1 on bars of half a period and 0 between them, with straight flanks."""
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
 
@@ -117,7 +119,7 @@ def _bars(at_um: Array, period_um: float) -> Array:
 def surface_noise(
     job: Job, printer: Printer, noise: Noise, knobs: KnobBoard, rng: np.random.Generator
 ) -> Array:
-    """Roughness of the surface, on the canvas, µm."""
+    """Return the roughness of the surface, on the canvas, µm."""
     canvas = job.canvas(printer.pitch_um)
     shape = canvas.level.shape
     if job.use in ("substrate", "grating"):

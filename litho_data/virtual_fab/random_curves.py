@@ -1,4 +1,4 @@
-"""Random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
+"""Make random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from litho_data.foundation.kinds import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
 # The spectrum of the measured prints' fine residual: a band of line-shaped features 0.45 µm apart across the
-# hatch direction, and a slower part; both are long along the hatch lines.
+# hatch direction, and a slower part. Both are long along the hatch lines.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
@@ -17,12 +17,12 @@ _SMOOTH_UM = 0.06
 
 
 def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
-    """Line-shaped roughness along x with unit variance on average, shape (ny, nx)."""
+    """Draw line-shaped roughness along x with unit variance on average, shape (ny, nx)."""
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
 
 def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
-    """Power spectrum of `line_roughness` on the half plane, arbitrary units."""
+    """Return the power spectrum of `line_roughness` on the half plane, arbitrary units."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     band = np.exp(-((np.abs(frequency_y) - _BAND_PER_UM) ** 2) / (2 * _BAND_WIDTH_PER_UM**2))
     slow = np.exp(-(frequency_y**2) / (2 * _SLOW_WIDTH_PER_UM**2))
@@ -34,7 +34,9 @@ def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
 
 
 def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
-    """Gaussian random field of a power spectrum given on the half plane; unit variance on average."""
+    """Draw a Gaussian random field with a power spectrum given on the half plane; unit variance on
+    average.
+    """
     # All columns but 0 and the Nyquist column stand for two frequencies of the full plane.
     doubled = np.full(psd.shape[1], 2.0)
     doubled[0] = 1.0
@@ -45,7 +47,7 @@ def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
 
 
 def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """One-dimensional Perlin noise within ±1, same shape as ``position_um``."""
+    """Draw one-dimensional Perlin noise within ±1, same shape as ``position_um``."""
     slopes = rng.uniform(-1, 1, 1024)
     cell, inside = np.divmod(position_um / period_um, 1.0)
     left = cell.astype(int) % slopes.size
@@ -56,7 +58,7 @@ def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator)
 
 
 def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Random sum of eight plane waves of about one period each, unit variance on average."""
+    """Draw a random sum of eight plane waves of about one period each, unit variance on average."""
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)
     phase = rng.uniform(0, 2 * np.pi, waves)

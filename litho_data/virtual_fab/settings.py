@@ -1,4 +1,4 @@
-"""The plain fab: printer, microscope and default noise, with units; and the named runs."""
+"""Settings of the plain fab: printer, microscope and default noise, with units, and named runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Printer:
 
     @property
     def full_height_um(self) -> float:
-        """Nominal height of the highest level, µm."""
+        """Return the nominal height of the highest level, µm."""
         return (self.levels - 1) * self.level_height_um
 
 
@@ -67,7 +67,9 @@ class Microscope:
 
     @classmethod
     def aligned(cls) -> Microscope:
-        """Scan pixels coincide with layout pixels: no warp, a margin of whole pixels."""
+        """Return a microscope whose scan pixels coincide with layout pixels: no warp, a margin of whole
+        pixels.
+        """
         return cls(rotation_deg=0.0, scale=0.0, shear=0.0, shift_um=0.0)
 
 
@@ -75,7 +77,7 @@ class Microscope:
 class Noise:
     """Default noise, standard deviations in nm.
 
-    A flat print shows the quadrature sum of all but the datum, a bare substrate that of
+    A flat print shows the quadrature sum of all but the datum; a bare substrate shows that of
     ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
 
     Args:
@@ -144,7 +146,7 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """The preset of that name.
+    """Return the preset of that name.
 
     Raises:
         InputError: no such preset.

@@ -1,4 +1,4 @@
-"""A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth separately."""
+"""Run the virtual fab: write raw files as a laboratory would deliver them, and the truth separately."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -47,11 +47,11 @@ def simulate(
     plan_of: str = "",
     print_pattern: str = PRINT_PATTERN,
 ) -> Path:
-    """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
+    """Print and scan a set of fields; return the path of the card, ``out/raw/card.toml``.
 
-    ``out/raw`` is what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` holds what
-    only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are made one at a
-    time, so memory does not grow with their number, and no scan depends on that number.
+    ``out/raw`` contains what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` contains
+    what only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are made one
+    at a time, so memory does not grow with their number, and no scan depends on that number.
 
     Args:
         count: number of scans with random layouts.
@@ -152,7 +152,7 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """One scan as its microscope writes it."""
+    """Write one scan as its microscope would."""
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
         write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
@@ -177,7 +177,7 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
 
 
 def _described(job: Job) -> dict[str, Any]:
-    """All fields of a job, with the hash in place of its layout."""
+    """Return all fields of a job, with the hash in place of its layout."""
     return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
@@ -199,7 +199,7 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """Write the card's table; it says how scans were made if any was made in another than the usual way."""
+    """Write the card's table, which says how scans were made if any was made in an unusual way."""
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
     write_table(raw, columns, [row[: len(columns)] for row in rows])
@@ -219,10 +219,10 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 
 
 def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
-    """Print and scan a plan in the fab of an earlier run; returns the path of the new card.
+    """Print and scan a plan in the fab of an earlier run; return the path of the new card.
 
-    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is new: draws for
-    single prints and scans are made afresh.
+    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is new: single
+    prints and scans are drawn afresh.
 
     Args:
         plan: folder with ``card.toml``, layouts and ``scans.csv``, as `litho-models next-print` writes it.

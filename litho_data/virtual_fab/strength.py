@@ -1,4 +1,4 @@
-"""The size of an effect in the data, and the strength for a given size."""
+"""Measure the size of an effect in the data, and find the strength for a given size."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,10 +34,10 @@ def strength_for_rms(
     jobs: Sequence[Job] | None = None,
     seed: int = 0,
 ) -> KnobStrength:
-    """The strength at which a knob changes the noise-free scans by ``rms_nm``.
+    """Find the strength at which a knob changes the noise-free scans by ``rms_nm``.
 
-    The rms is that of `knob_rms_nm`; it grows with the strength, so the strength is found by
-    interval search within the knob's range.
+    The rms is that of `knob_rms_nm`. It grows with the strength, so the strength is found by interval search
+    within the knob's range.
 
     Args:
         name: knob.
@@ -62,7 +62,7 @@ def strength_for_rms(
         strength = min(rms_nm, highest)
         return KnobStrength(KnobSetting(name, strength, seed), strength)
     at_limit = measured(highest)
-    # Remainders at the rounding of float32 are no trace of the effect.
+    # Remainders of the size of float32 rounding are no trace of the effect.
     if at_limit < 1e-3:
         raise InputError(
             f"knob {name}", got="no trace beside offset, gain, plane and bow", wanted="another knob"
@@ -81,7 +81,8 @@ def search_strength(
     at_highest: float,
     precision: float = _RELATIVE_PRECISION,
 ) -> tuple[float, float]:
-    """The strength below ``highest`` at which a growing measure reaches ``wanted``, and the measure there.
+    """Find the strength below ``highest`` at which a growing measure reaches ``wanted``; also return the
+    measure there.
 
     Args:
         measured: gives the measure at a strength; ``at_highest``: the measure at ``highest``, above
@@ -89,7 +90,7 @@ def search_strength(
         precision: largest relative distance from ``wanted``.
     """
     low, high = 0.0, highest
-    # Most effects grow about linearly, some quadratically: the first guess assumes linear growth.
+    # Most effects grow about linearly, some quadratically, so the first guess assumes linear growth.
     strength = highest * wanted / at_highest
     for _ in range(_MAX_STEPS):
         found = measured(strength)
@@ -102,10 +103,11 @@ def search_strength(
 
 
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
-    """Rms over the scans of (noise-free scan with the knob) − (without), without nuisances, nm.
+    """Return the rms over the scans of (noise-free scan with the knob) − (without), after the per-scan terms
+    are removed, nm.
 
-    Scans are aligned with the layout, so a warp counts by the heights that it changes. The least-squares
-    fit of {1, P, x, y, x², xy, y²} is removed from each scan, P the scan without the knob.
+    Scans are aligned with the layout, so a warp counts by the heights that it changes. The least-squares fit
+    of {1, P, x, y, x², xy, y²} is removed from each scan, where P is the scan without the knob.
     """
     mean_squares = []
     for job in jobs:
@@ -116,7 +118,9 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """``change`` minus its least-squares fit by the prediction and a quadratic surface, same shape."""
+    """Subtract from ``change`` its least-squares fit by the prediction and a quadratic surface, same
+    shape.
+    """
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )
@@ -127,7 +131,9 @@ def _free_of_nuisances(change: Array, prediction: Array) -> Array:
 
 
 def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
-    """Four fields of 256 × 256 px, two of each cut-off: first, two middle ones and last of a print order."""
+    """Return four fields of 256 × 256 px, two of each cut-off: the first, two middle ones and the last of a
+    print order.
+    """
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 
 

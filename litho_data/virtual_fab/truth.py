@@ -1,4 +1,4 @@
-"""What a simulated run hides from the build: knobs, warps, clean prints and the noise floor."""
+"""The record of what a simulated run hides from the build: knobs, warps, clean prints and the noise floor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class KnobTruth(Record):
 
     @classmethod
     def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
-        """The record of a setting, with the seed that was used."""
+        """Return the record of a setting, with the seed that was used."""
         knob = KNOBS[setting.name]
         return cls(
             name=knob.name,
@@ -40,12 +40,14 @@ class KnobTruth(Record):
 
     @property
     def setting(self) -> KnobSetting:
-        """The setting with the seed that was used, to repeat it."""
+        """Return the setting with the seed that was used, to repeat it."""
         return KnobSetting(self.name, self.strength, self.seed)
 
 
 class ScanTruth(Record):
-    """One scan: position, datum, and the remaining error of perfect models of print and microscope."""
+    """One scan: its position, its datum, and the remaining error of perfect models of print and
+    microscope.
+    """
 
     id: str
     use: str
@@ -62,9 +64,11 @@ class ScanTruth(Record):
 
 
 class Truth(Result):
-    """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
+    """The record `truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as
+    ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid. ``settings``: further settings of the run; None in older files.
+    Both are heights in µm on the layout grid. ``settings`` contains further settings of the run; None in
+    older files.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -80,7 +84,9 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow, nm."""
+    """Return the size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow,
+    nm.
+    """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
     return {

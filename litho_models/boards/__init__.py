@@ -1,1 +1,1 @@
-"""Boards: stores of the virtual fab with hidden causes, and the judge of a loop's answers."""
+"""Boards: stores from the virtual fab with hidden causes, and a judge for the answers of a loop."""

@@ -1,4 +1,4 @@
-"""A board that any loop can enter: stores, a record of their hidden causes, and the judge."""
+"""Make a board that any loop can enter: stores, a record of their hidden causes, and the judge."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
-# The printers of singles are all Physics models. Mixtures have others too, so the best base is chosen.
+# All printers of singles are Physics models. Mixtures also have other printers, so the best base model is
+# chosen.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
-# Maps a dataset store and an empty working folder to the loop's answer.
+# A function that maps a dataset store and an empty working folder to the loop's answer.
 Loop = Callable[[Path, Path], Answer]
 
 
@@ -146,7 +147,7 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """Wrap a command as a loop. The command gets STORE and FOLDER as last arguments and writes
+    """Wrap a command as a loop. The command receives STORE and FOLDER as its last arguments and writes
     FOLDER/answer.json.
 
     Raises:
@@ -179,17 +180,17 @@ def _trial(draw: Draw, draws: Draws, board: Path, folder: Path, loop: Loop) -> T
 
 
 def name_of(draw: Draw) -> str:
-    """Name of a trial's files and folders: two digits."""
+    """Return the name of a trial's files and folders: two digits."""
     return f"{draw.number:02d}"
 
 
 def store_of(board: Path, draw: Draw) -> Path:
-    """The store that a loop is given."""
+    """Return the path of the store that a loop receives."""
     return board / STORES / f"{name_of(draw)}.zarr"
 
 
 def cpu_s() -> float:
-    """Processor seconds of this process and its finished children."""
+    """Return the processor seconds of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 

@@ -17,7 +17,8 @@ from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest drawn size. A size set on four scans may be 13 % smaller on all scans, and must still count.
+# Smallest drawn size. A size that was set on four scans may be 13 % smaller on all scans, and must still
+# count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
@@ -26,9 +27,10 @@ MIXTURES_RMS_NM = (8.0, 25.0)
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
-# Not drawn: the first is part of the default noise; a refit leaves less than 10 nm of the second.
+# These are not drawn: the first is part of the default noise, and a refit leaves less than 10 nm of the
+# second.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# New in every scan, or no change of the height map, so no model of all scans can contain them.
+# These are new in every scan, or do not change the height map, so no model of all scans can contain them.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -39,7 +41,7 @@ _OF_SINGLE_SCANS = {
 }
 # The measured prints may already have these, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
-# Knobs added after the first boards, left out there to keep their draws.
+# These knobs were added after the first boards and are left out there, so that the draws stay the same.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
 # Ranges of the printers' parameters, around the fab's defaults and within the bounds of Physics.
 _PRINTER_RANGES = {
@@ -66,7 +68,7 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
 
 
 def names_of(cause: str) -> tuple[str, ...]:
-    """Names in the catalogue that are right for a knob or a form."""
+    """Return the names in the catalogue that are right for a knob or a form."""
     if cause in FORMS:
         return FORMS[cause].names
     effect = KNOBS[cause].effect
@@ -109,7 +111,7 @@ def _draw_singles(rng: np.random.Generator) -> list[Draw]:
 
 
 def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
-    """Draw about as many causes in form as of another form. No two in a trial share a right name."""
+    """Draw about as many causes in form as causes of another form. No two in a trial share a right name."""
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
     deck = chain.from_iterable(zip(in_form, other, strict=False))
@@ -182,7 +184,9 @@ def _deal(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Deal from a deck until there are ``size`` causes; skip those whose right names are refused or taken."""
+    """Deal from a deck until there are ``size`` causes; skip causes whose right names are refused or
+    taken.
+    """
     names = list(started)
     while len(names) < size:
         name = next(deck)

@@ -1,4 +1,4 @@
-"""The scoreboard: all draws with their outcomes, and headline figures."""
+"""Make the scoreboard: all draws with their outcomes, and the headline figures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
 
-# Largest accepted error with the findings, as a multiple of the true models' error.
+# Return the largest accepted error with the findings, as a multiple of the true models' error.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -53,7 +53,7 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Hits and total, with the exact 95 % interval (Clopper and Pearson)."""
+    """Format hits and total with the exact 95 % interval (Clopper and Pearson)."""
     known = [*hits]
     if not known:
         return "none of 0"
@@ -62,7 +62,7 @@ def share(hits: Iterable[bool]) -> str:
 
 
 def counted(trials: Iterable[Trial]) -> list[Counted]:
-    """Causes above 8 nm; if a trial failed before sizing, causes drawn above 8 nm."""
+    """Return causes above 8 nm; if a trial failed before its causes were sized, those drawn above 8 nm."""
     found = []
     for trial in trials:
         sizes = {one.name: one.wanted_rms_nm for one in trial.draw.causes}
@@ -76,7 +76,9 @@ def counted(trials: Iterable[Trial]) -> list[Counted]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """The headline figures. In a failed trial no cause counts as found, and the error counts as too large."""
+    """Compute the headline figures. In a failed trial no cause counts as found, and the error counts as too
+    large.
+    """
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
     empty = [
@@ -105,7 +107,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
 
 
 def figure_lines(scoreboard: Scoreboard) -> list[str]:
-    """The headline figures as lines for a terminal."""
+    """Return the headline figures as lines for a terminal."""
     return [
         f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else "")
         for what, value, wanted in figures_of(scoreboard)
@@ -113,13 +115,13 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Whether the error with the findings is within the tolerance; False if unknown."""
+    """Return whether the error with the findings is within the tolerance; False if unknown."""
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= tolerance(trial)
 
 
 def tolerance(trial: Trial) -> float:
-    """Largest accepted error with the findings, as a multiple of the true models' error."""
+    """Return the largest accepted error with the findings, as a multiple of the true models' error."""
     return TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 
 
@@ -187,7 +189,7 @@ def _causes(what: str, causes: Iterable[Counted], verdicts: Sequence[Verdict], w
 
 
 def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
-    """One row per planted cause, and one per trial without causes; sizes in nm, empty where unknown."""
+    """Return one row per planted cause and one per trial without causes; sizes in nm, empty if unknown."""
     rows: list[dict[str, Any]] = []
     for trial in scoreboard.trials:
         set_as = {one.draw.name: one for one in trial.planted}

@@ -1,6 +1,6 @@
 """Compare a loop's answer with the planted causes, and its error with that of the true models.
 
-docs/blind_trials.md states the rules before a board is run.
+The rules are stated in docs/blind_trials.md before a board is run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# For these forms the name is right only with this exponent.
+# A name for these forms is right only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # This form consists of line offsets, so a loop that reports line offsets has noticed it.
@@ -103,7 +103,9 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Named sets of causes that contain nothing planted, where the base's form also counts as planted."""
+    """Return the named sets of causes that contain nothing planted, where the base's form also counts as
+    planted.
+    """
     return [
         " | ".join(named.names)
         for named in _beyond_noise(answer.found)
@@ -112,7 +114,7 @@ def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
 
 
 def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
-    """The planted causes, without the base's form."""
+    """Return the planted causes, without the form of the base."""
     return [one for one in planted if one.draw in draw.causes]
 
 
@@ -126,7 +128,7 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Whether the loop found a displacement along x by a grouping that separates scans as planted."""
+    """Return whether the loop found a displacement along x in groups that separate the scans as planted."""
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
         labels: dict[str, set[bool]] = {}
@@ -138,7 +140,7 @@ def _displacement_is_shared(
 
 
 # No model of all scans can predict these: values drawn anew in every scan (or line), rounding, and scars at
-# random positions. Bends stay in, because the store's transform contains them.
+# random positions. Bends are not among them, because the store's transform contains them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -155,7 +157,7 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Mean absolute error of the noise-free scans with all causes, k = 1, nm.
+    """Return the mean absolute error of the noise-free scans with all causes, k = 1, nm.
 
     The store's transform (and bend) of each scan maps it onto the layout. Scans, pixels and terms per scan
     are those of the loop's scores.
@@ -182,9 +184,9 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Median relative error of the base's values, without and with the findings.
+    """Return the median relative error of the base's values, without and with the findings.
 
-    None if printer or base is not a Physics model.
+    Return None if printer or base is not a Physics model.
     """
     if draw.base or draw.kind == "measured" or not answer.base_values:
         return None
@@ -192,7 +194,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # The sd of the squared spot, if the base fits it.
+    # This is the sd of the squared spot, if the base fits it.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:
@@ -202,7 +204,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 
 
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
-    """Make the result of a trial that ended with an error, and print the error.
+    """Make the result of a trial that ended with an exception, and print the exception.
 
     Paths are replaced by names, because results are published.
     """

@@ -22,7 +22,7 @@ from litho_data.virtual_fab.geometry import ScanFrame
 
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
-# Maps (field, strength, canvas or frame of the scan, job) to the changed field.
+# A function that maps (field, strength, canvas or frame of the scan, job) to the changed field.
 Law = Callable[..., np.ndarray]
 Draw = Callable[[np.random.Generator], Law]
 
@@ -56,7 +56,7 @@ FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """Several forms with strengths, which the fab applies in turn at each stage."""
+    """Several forms with strengths, which the fab applies one after the other at each stage."""
 
     def __init__(self, strengths: Mapping[str, float], seed: int):
         self._laws = [
@@ -220,7 +220,7 @@ def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: np.random.Generator) -> Law:
     """Height lost per slope, only on flanks that fall in one direction."""
-    # This is half a loss on both flanks and half a displacement, which registration removes.
+    # This is half a loss on both flanks and half a displacement; registration removes the displacement.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -420,12 +420,16 @@ def _slope_along(surface: np.ndarray, canvas: Canvas, direction: float) -> np.nd
 
 
 def _across(canvas: Canvas, axis: int) -> np.ndarray:
-    """Position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the last."""
+    """Return the position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the
+    last.
+    """
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> np.ndarray:
-    """True on one side of a seam; ``side`` gives the axis that it crosses, and the side."""
+    """Return a mask that is True on one side of a seam; ``side`` gives the axis that the seam crosses, and
+    the side.
+    """
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

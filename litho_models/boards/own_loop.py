@@ -1,4 +1,4 @@
-"""Our closed loop as an entry of a board."""
+"""Enter our closed loop in a board."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from litho_models.loop.run import close_loop
 def own_loop(
     store: Path, folder: Path, *, base: str, report: Callable[[str], None] = lambda message: None
 ) -> Answer:
-    """Run our closed loop on a store, with results in ``folder/loop``; ``base``: the model to correct."""
+    """Run our closed loop on a store, with results in ``folder/loop``; ``base`` is the model to correct."""
     return answer_of(close_loop(store, folder / "loop", base=base, report=report))
 
 

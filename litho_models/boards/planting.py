@@ -1,8 +1,8 @@
 """Plant the causes of a trial at their strengths, and print its fields.
 
-The size of a cause is the rms that the best refitted base cannot absorb. The Physics model, which contains
-the plain fab, is fitted to the noise-free scans with the cause. Datum, gain, tilt, bow and an affine
-registration error are free in each scan.
+The size of a cause is the rms of the change that the best refitted base cannot absorb. The Physics model,
+which contains the plain fab, is fitted to the noise-free scans with the cause. Datum, gain, tilt, bow and an
+affine registration error are free in each scan.
 """
 
 from __future__ import annotations
@@ -31,23 +31,24 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# The search for a strength uses four scans (both cut-offs, spread over the order); its size uses all.
+# The search for a strength uses four scans (both cut-offs, spread over the order); the size is measured on
+# all scans.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
 
 def printer_of(draw: Draw) -> Printer:
-    """The printer of a trial: the default printer with the drawn parameters."""
+    """Return the printer of a trial: the default printer with the drawn parameters."""
     return replace(Printer(), **draw.printer)  # type: ignore[arg-type]
 
 
 def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
-    """The fields of a trial, as ``litho-data simulate`` makes them with this seed."""
+    """Make the fields of a trial as ``litho-data simulate`` makes them with this seed."""
     return tuple(random_jobs(Plan(n_scans, (size_px, size_px)), printer_of(draw), draw.seed))
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """The strength of a cause in a scan, as a share of its full strength."""
+    """Return the strength of a cause in a scan, as a share of its full strength."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -63,7 +64,7 @@ def fab_of(
     microscope: Microscope | None = None,
     without: Collection[str] = (),
 ) -> Fab:
-    """The fab that prints and scans one field, with all planted causes at their strength there.
+    """Make the fab that prints and scans one field, with all planted causes at their strength in this field.
 
     Args:
         draw: the trial as drawn.
@@ -86,10 +87,11 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength at which each cause alone has its drawn size on these fields, the base's form first.
+    """Find the strength at which each cause alone has its drawn size on these fields, first for the form of
+    the base.
 
-    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded;
-    nothing is drawn again. An alias is sized by its change of the scans before a refit, because the refit
+    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded.
+    Nothing is drawn again. The size of an alias is its change of the scans before a refit, because the refit
     absorbs most of it.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
@@ -97,7 +99,7 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
-    """Print and scan all fields into raw files, and return their card, which states only required facts."""
+    """Print and scan all fields into raw files; return their card, which states only required facts."""
     (folder / "scans").mkdir(parents=True)
     for job in jobs:
         scan = scan_job(fab_of(draw, planted, job), job)
@@ -117,7 +119,7 @@ def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folde
 
 
 def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> list[np.ndarray]:
-    """Scans (y, x) without noise and on the layout's grid, µm."""
+    """Return scans (y, x) without noise and on the layout's grid, µm."""
     found = []
     for job in jobs:
         fab = fab_of(draw, planted, job, noise=Noise.off(), microscope=Microscope.aligned())
@@ -129,7 +131,8 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
 
 
 def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer) -> float:
-    """Rms residual of noise-free prints, nm, after a refit of the Physics model and the scan terms.
+    """Return the rms residual of noise-free prints, nm, after a refit of the Physics model and the scan
+    terms.
 
     Args:
         heights_um: (y, x) on the layout's grid, µm, one per job.
@@ -146,14 +149,14 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
 
 class _Refit(ModelProblem):
-    """Least-squares fit of the model together with orthonormal terms of each scan."""
+    """Fit the model together with orthonormal terms of each scan by least squares."""
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]
 
 
 def plain_model(printer: Printer) -> Simulator:
-    """The Physics model with the values that reproduce the plain fab."""
+    """Return the Physics model with the values that reproduce the plain fab."""
     return build_model(
         "physics",
         pitch_um=printer.pitch_um,

@@ -57,7 +57,7 @@ class Draw(Record):
 
 
 class Draws(Result):
-    """All trials of a board, written before any trial runs; ``base``: the model that loops correct."""
+    """All trials of a board, written before any trial runs; ``base`` is the model that loops correct."""
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trial-draws/2"
     FILE_NAME: ClassVar[str] = "draws.json"
@@ -102,14 +102,14 @@ class Hidden(Result):
 
 
 class Outcome(Record):
-    """Outcome of one planted cause, or of the whole trial if nothing was planted."""
+    """The outcome of one planted cause, or of the whole trial if nothing was planted."""
 
     name: str
     verdict: Verdict
 
 
 class TrialErrors(Record):
-    """Mean absolute errors on held-out scans, k = 1, of base, corrected model and true models.
+    """Mean absolute errors of base, corrected model and true models on held-out scans, k = 1.
 
     The true models of measured prints are unknown.
     """
@@ -120,7 +120,7 @@ class TrialErrors(Record):
 
     @property
     def ratio(self) -> float | None:
-        """Ratio of the corrected model's error to that of the true models."""
+        """Return the ratio of the corrected model's error to that of the true models."""
         return self.after_nm / self.floor_nm if self.floor_nm else None
 
 
@@ -166,7 +166,7 @@ class Answer(Result):
 
 
 class Trial(Result):
-    """The result of one trial; a failed one has a reason and no errors.
+    """The result of one trial; a failed trial has a reason and no errors.
 
     Attributes:
         false_names: named sets of causes that contain nothing planted.
@@ -192,7 +192,9 @@ class Trial(Result):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard."""
+    """All trials of a board; ``pending`` trials were drawn but not run, and ``command`` reproduces the
+    scoreboard.
+    """
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trials/3"
     FILE_NAME: ClassVar[str] = "scoreboard.json"

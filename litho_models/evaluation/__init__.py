@@ -1,1 +1,1 @@
-"""Models scored on datasets: evaluation, benchmark, comparison, with their reports."""
+"""Score models on datasets: evaluation, benchmark and comparison, with their reports."""

@@ -56,7 +56,8 @@ def benchmark(
     workers: int = 1,
     dask: str | None = None,
 ) -> Benchmark:
-    """Train and score ``models`` out of fold; write ``benchmark.json``, a report and CSV tables.
+    """Train ``models`` without each fold and score them on it; write ``benchmark.json``, a report and CSV
+    tables.
 
     Args:
         store: dataset store.
@@ -185,7 +186,7 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[PrintedScan]) -> None:
-    """Refuse to replace a benchmark that contains more; the same one may be repeated or extended."""
+    """Refuse to replace a benchmark that contains more; the same benchmark may be repeated or extended."""
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)

@@ -1,4 +1,4 @@
-"""Evaluate one frozen model on a dataset: ``evaluation.json`` and a report."""
+"""Evaluate one frozen model on a dataset, and write ``evaluation.json`` and a report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,10 +41,10 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    If the model was trained on these prints (on this store or another one from the same raw files), locked
-    scans are not scored unless ``open_lock_box`` is set. Scans are locked by this store, or were locked when
-    the model was made. A model of other prints is scored on all scans. The result states which scans were
-    locked, and whether any of them was scored.
+    If the model was trained on these prints (on this store or on another store from the same raw files),
+    locked scans are scored only if ``open_lock_box`` is set. Scans are locked if this store locks them, or if
+    they were locked when the model was made. A model made from other prints is scored on all scans. The
+    result states which scans were locked, and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.

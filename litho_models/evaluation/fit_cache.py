@@ -1,4 +1,4 @@
-"""The cache of a benchmark's fits, with predictions of held-out scans, record and diagnostics.
+"""Cache a benchmark's fits, with predictions of held-out scans, record and diagnostics.
 
 Each (model, fold) has its own folder, named by the hash of everything that determines the fit.
 """
@@ -32,9 +32,9 @@ from litho_models.splits.folds import Fold
 class FitDiagnostics(Record):
     """Errors of one fitted model on its training scans and on held-out scans.
 
-    All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
-    that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
-    ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
+    All three errors are means over scans of the datum-free error of policy ``offset``, without a background,
+    so that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
+    ``measurement`` is the measurement model learned with the fit, if the training scans were freed of it.
     """
 
     # Older results also say what a prediction cost, and how it changes in another crop.
@@ -97,7 +97,7 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Training scans without the measurement model that is learned from this model's predictions."""
+    """Remove from the training scans the measurement model that is learned from this model's predictions."""
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -106,7 +106,7 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """The expected scan: the print (ny, nx), µm, and what the training scans share."""
+    """Return the expected scan: the print (ny, nx), µm, and what the training scans share."""
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)
@@ -116,12 +116,12 @@ def expected(
 
 
 def fit_folder(cache: Path, name: str, key: str) -> Path:
-    """The folder of a fit."""
+    """Return the folder of a fit."""
     return cache / f"{name}-{key[:16]}"
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """The record of a fit and its heights (ny, nx) of ``held_out_ids``, µm.
+    """Read the record of a fit and its heights (ny, nx) of ``held_out_ids``, µm.
 
     Raises:
         InputError: files that are missing or damaged.

@@ -1,4 +1,4 @@
-"""Plots of the evaluation and benchmark reports."""
+"""Draw the plots of the evaluation and benchmark reports."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ if TYPE_CHECKING:
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
-# Maps a row of a model to x and one or two y.
+# A function that maps a row of a model to x and one or two y.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
 def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
-    """Both headline errors of each model with their intervals over scans, the noise floor and the paper."""
+    """Draw both headline errors of each model with their intervals over scans, the noise floor and the
+    paper's error.
+    """
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
     position = np.arange(len(scores))
@@ -63,7 +65,9 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
 
 
 def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Measured height of one scan and, per model, measured minus predicted, freed of its nuisances."""
+    """Draw the measured height of one scan and, for each model, measured minus predicted without the scan's
+    terms.
+    """
     panels = len(residuals_um) + 1
     columns = min(4, panels)
     rows = -(-panels // columns)
@@ -90,7 +94,7 @@ def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """The middle row of one scan: layout, measurement, and the models with the scan's nuisances added."""
+    """Draw the middle row of one scan: layout, measurement, and the models with the scan's terms added."""
     figure = new_figure(10, 3.4)
     axes = figure.subplots()
     row = scan.shape[0] // 2
@@ -105,13 +109,13 @@ def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def residual_um(scan: PrintedScan, prediction_um: np.ndarray, protocol: NuisanceProtocol) -> np.ndarray:
-    """Cross-fitted residual of one scan under the protocol, µm."""
+    """Return the cross-fitted residual of one scan under the protocol, µm."""
     terms = policy_terms(protocol.policy)
     return cross_fit(scan.height_um, prediction_um, scan.valid, terms, protocol.blocks).residual_um
 
 
 def level_bias(scores: Sequence[ModelScores]) -> Figure:
-    """Bias and spread of the datum-free error per printed level."""
+    """Draw bias and spread of the datum-free error per printed level."""
 
     def of(name: str) -> Lines:
         return lambda score: [[getattr(one, key) for one in score.by_level] for key in ("level", name)]
@@ -121,7 +125,9 @@ def level_bias(scores: Sequence[ModelScores]) -> Figure:
 
 
 def transfer(scores: Sequence[ModelScores]) -> Figure:
-    """Transfer, coherence and error density against spatial frequency, along x (solid) and y (dashed)."""
+    """Draw transfer, coherence and error density against spatial frequency, along x (solid) and y
+    (dashed).
+    """
 
     def of(name: str) -> Lines:
         return lambda score: [
@@ -140,7 +146,7 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """A panel for each label, a colour for each model: x, then a solid and perhaps a dashed line."""
+    """Draw a panel for each label and a colour for each model: x, then a solid and perhaps a dashed line."""
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (label, lines) in zip(grid, panels.items(), strict=True):

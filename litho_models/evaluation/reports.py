@@ -1,4 +1,4 @@
-"""``report.html`` of an evaluation and of a benchmark."""
+"""Write ``report.html`` of an evaluation or a benchmark."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ _SPLIT_TEXT = {
 def write_evaluation_report(
     result: Evaluation, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], out: str | Path
 ) -> Path:
-    """Render the result into ``out``; returns the page."""
+    """Render the result into ``out``; return the page."""
     scores = result.scores
     page = _page(f"{result.model.name} on {result.dataset.name}", result, {"model": result.model.sha256})
     page.verdict(evaluation_verdict(result))

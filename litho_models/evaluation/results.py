@@ -1,4 +1,4 @@
-"""The records ``evaluation.json`` and ``benchmark.json``, and the comparison of two of them."""
+"""The records ``evaluation.json`` and ``benchmark.json``, and a comparison of two of them."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class ScoredResult:
 
 
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
-    """Datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
+    """Compare the datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
 
     Two benchmarks are compared model by model; an evaluation has one model. A negative
     difference means that the first is better.
@@ -158,6 +158,6 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """The first digits of a hash, which are enough to show a difference."""
+    """Return the first digits of a hash, which are enough to show a difference."""
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

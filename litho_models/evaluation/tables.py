@@ -1,4 +1,4 @@
-"""Tables of the reports of an evaluation and a benchmark."""
+"""Make the tables in the reports of an evaluation and a benchmark."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ Rows = list[dict[str, Any]]
 def headline_table(
     scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
 ) -> pd.DataFrame:
-    """One row per model, with both errors and their intervals, excess over the noise floor, spread and bias.
+    """Return one row per model, with both errors and their intervals, excess over the noise floor, spread and
+    bias.
 
-    The last row is the floor itself, in each column for the scan terms of that column. Films have errors of
-    edges and features instead.
+    The last row is the floor itself, in each column for the scan terms of this column. For films the table
+    has errors of edges and features instead.
     """
     import pandas as pd
 
@@ -73,9 +74,10 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """One row per model and background, one column per policy; for line offsets also the number of terms.
+    """Return one row per model and background and one column per policy; for line offsets also the number of
+    terms.
 
-    The last row is the noise floor under each.
+    The last row is the noise floor under each policy.
     """
     rows = []
     for s in scores:
@@ -97,7 +99,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
-    """One row per model: phase error, and all metrics of ``metric_registry``."""
+    """Return one row per model: phase error, and all metrics of ``metric_registry``."""
     keys = [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
     return [
         {
@@ -110,7 +112,7 @@ def metric_table(scores: Sequence[ModelScores]) -> Rows:
 
 
 def scan_table(scores: Sequence[ModelScores]) -> Rows:
-    """One row per model and scan."""
+    """Return one row per model and scan."""
     return [
         {
             "model": s.model,
@@ -125,7 +127,7 @@ def scan_table(scores: Sequence[ModelScores]) -> Rows:
 
 
 def level_table(scores: Sequence[ModelScores]) -> Rows:
-    """One row per model and printed level."""
+    """Return one row per model and printed level."""
     return [{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level]
 
 

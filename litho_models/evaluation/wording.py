@@ -23,7 +23,7 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """State the error of the model, its part from the zero height, and the noise."""
+    """State the error of the model, the part of it that comes from the zero height, and the noise."""
     return _verdict(result, result.scores)
 
 
@@ -33,5 +33,5 @@ def _verdict(result: Benchmark | Evaluation, best: ModelScores, **more: object) 
 
 
 def said(name: str, **values: object) -> list[str]:
-    """The lines of a template: ``verdict``, ``protocol``, ``notes`` or ``paper``."""
+    """Return the lines of a template: ``verdict``, ``protocol``, ``notes`` or ``paper``."""
     return filled(Path(__file__).with_name(f"{name}.jinja"), **values).splitlines()

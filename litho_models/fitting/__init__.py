@@ -1,4 +1,4 @@
-"""Fitting models to printed scans."""
+"""Fit models to printed scans."""
 
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.fit import Fitted, fit, fit_in_cache, fit_with_record

@@ -1,4 +1,4 @@
-"""Checkpoints of a training: weights, optimiser moments, best weights, history."""
+"""Store checkpoints of a training: weights, optimiser moments, best weights, history."""
 
 import json
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ class TrainingState:
 
     @property
     def step(self) -> int:
-        """Optimiser steps done."""
+        """Return the number of optimiser steps done."""
         return self.history[-1].step if self.history else 0
 
     def record(self, record: RoundRecord) -> None:
@@ -56,7 +56,7 @@ class TrainingState:
         """Write weights, best weights and moments."""
         buffer = BytesIO()
         torch.save((self.model.state_dict(), self.best, self.optimiser.state_dict()), buffer)
-        # Not written by torch itself, which raises no OSError on a full disk.
+        # torch does not write the file itself, because it raises no OSError on a full disk.
         file.write_bytes(buffer.getvalue())
 
     def load(self, file: Path, history: list[RoundRecord]) -> None:
@@ -71,7 +71,7 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Read the files of an earlier call in ``folder``, which are always written as a whole.
+    """Read the files that an earlier call stored in ``folder``; they are always written as a whole.
 
     Raises:
         InputError: a missing or damaged file.
@@ -91,7 +91,7 @@ def reading_kept(folder: Path) -> Iterator[None]:
 
 
 class CheckpointFolder:
-    """One folder that always holds the last complete checkpoint; ``key`` names the run it belongs to.
+    """A folder that always contains the last complete checkpoint; ``key`` names the run to which it belongs.
 
     Raises:
         InputError: the folder holds a checkpoint of another model, configuration or data, or a damaged one.
@@ -110,7 +110,7 @@ class CheckpointFolder:
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     def load(self, state: TrainingState) -> None:
-        """Continue from the checkpoint, if there was one.
+        """Continue from the checkpoint, if there is one.
 
         Raises:
             InputError: its tensors are damaged.

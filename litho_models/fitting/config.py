@@ -1,4 +1,4 @@
-"""The settings of a training: a frozen, explicit record that every run saves."""
+"""The settings of a training, in a frozen, explicit record that every run saves."""
 
 from typing import Any, Literal, Self, get_args
 
@@ -13,9 +13,9 @@ RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # In a default PBL the steps train only the chain, which the feature networks then correct. A short training
-# is enough, and no scan is needed to choose between rounds.
+# is therefore enough, and no scan is needed to choose between rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
-# Settings that a fit by least squares depends on.
+# Settings on which a fit by least squares depends.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance", "free_gain"}
 # Upper limit of all counts. No real case needs more, and larger sums lose digits or overflow.
 _MOST = 10**9
@@ -62,10 +62,10 @@ class TrainingConfig(BaseModel):
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
-        """The settings of a named recipe for a model; ``settings`` override single fields.
+        """Return the settings of a named recipe for a model; ``settings`` override single fields.
 
-        ``paper``: Adam, batch 4, L1, 4,000 epochs of 72 quadrants, the paper's learning rates, no
-        nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly, and
+        ``paper``: Adam, batch 4, L1, 4,000 epochs of 72 quadrants, the paper's learning rates, no per-scan
+        terms. ``fast``: AdamW with a one-cycle schedule, random crops, per-scan terms fitted jointly, and
         ``FAST_STEPS``, or ``FAST_CHAIN`` for the default PBL.
 
         Raises:
@@ -93,16 +93,16 @@ class TrainingConfig(BaseModel):
         return cls(**{"recipe": recipe, **paper, **settings})
 
     def takes_steps(self, model: Simulator) -> bool:
-        """Whether the model is trained by stochastic gradient rather than by least squares.
+        """Return whether the model is trained by stochastic gradient rather than by least squares.
 
-        Large models are, unless they are linear in their parameters; small models are only in the paper's
-        recipe.
+        Large models are trained this way unless they are linear in their parameters; small models only in the
+        paper's recipe.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
 
     def used_by(self, model: Simulator) -> dict[str, Any]:
-        """The settings that decide a fit of ``model``, for its record."""
+        """Return the settings that decide a fit of ``model``, for its record."""
         if self.takes_steps(model):
             return self.model_dump(mode="json")
         optimiser = "gauss-newton" if is_small(model) else "ridge"

@@ -10,7 +10,7 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# Pixels per pass, because a network keeps hundreds of bytes per pixel for its gradient.
+# Number of pixels per pass, limited because a network keeps hundreds of bytes per pixel for its gradient.
 _PASS_PX = 256**2
 
 
@@ -25,7 +25,9 @@ class Window:
 
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
-    """The window of (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels continue."""
+    """Cut the window of (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels
+    continue.
+    """
     (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
     ny, nx = field.shape
     if min(top, left) >= 0 and top + size <= ny and left + size <= nx:
@@ -37,13 +39,15 @@ def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
 
 
 def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
-    """Cut one window each, as a float32 batch (b, 1, y, x)."""
+    """Cut one window from each field and stack them as a float32 batch (b, 1, y, x)."""
     crops = [cut(fields[window.scan], window, margin_px) for window in windows]
     return torch.from_numpy(np.stack(crops)[:, None].astype(np.float32))
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """The windows of one optimiser step, which depend only on seed and step, so resumed runs are equal."""
+    """Choose the windows of one optimiser step, which depend only on seed and step, so that resumed runs are
+    equal.
+    """
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
     random = np.random.default_rng([config.seed, step])
@@ -57,10 +61,10 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 
 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
-    """The windows of a step in groups that go through the network one after the other.
+    """Group the windows of a step; the groups go through the network one after the other.
 
-    On a CPU a group has at most ``_PASS_PX`` pixels, or one window, which bounds the memory and costs no
-    time; elsewhere all windows form one group.
+    On a CPU a group has at most ``_PASS_PX`` pixels, or one window, which limits the memory and costs no
+    time. Elsewhere all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":
@@ -69,7 +73,7 @@ def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Wind
 
 
 def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:
-    """All squares of a regular grid that fit: four quadrants of 256 px in a scan of 512 px."""
+    """Return all squares of a regular grid that fit: four quadrants of 256 px in a scan of 512 px."""
     return [
         Window(scan, y, x, size_px)
         for scan, (ny, nx) in enumerate(shapes)
@@ -92,7 +96,7 @@ def _from_permuted_quadrants(
 
 
 def grid_pixels(scan: PrintedScan, count: int) -> np.ndarray:
-    """Flat indices of the measured pixels on a square grid of about ``count`` pixels."""
+    """Return the flat indices of the measured pixels on a square grid of about ``count`` pixels."""
     step = max(1, round((scan.usable.size / count) ** 0.5))
     grid = np.zeros_like(scan.usable)
     grid[::step, ::step] = True

@@ -26,13 +26,13 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# A model in closed form that is close to the data, for a network's first scan terms.
+# A model in closed form that is close to the data; it gives a network's first scan terms.
 FIRST_MODEL = "linear"
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fitted model and how it was fitted; ``history`` is empty for models without rounds."""
+    """A fitted model and the history of its fit, which is empty for models without rounds."""
 
     model: Simulator
     training_ids: list[str]
@@ -79,7 +79,7 @@ def fit_with_record(
             f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
         )
     model = build_model(model_name, config.variant, **geometry, **fields)
-    # Checked even if the model writes no checkpoint, because the folder may contain another model's.
+    # The folder is checked even if the model writes no checkpoint, because it may contain another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
@@ -104,7 +104,7 @@ def fit_with_record(
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
         history=history,
-        # Includes the time before an interruption.
+        # This includes the time before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
     )
 
@@ -114,7 +114,7 @@ def fit_in_cache(
 ) -> Fitted:
     """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
 
-    A benchmark and a loop that train the same model on the same scans reuse each other's fits there.
+    A benchmark and a loop that train the same model on the same scans thus reuse each other's fits.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
@@ -122,7 +122,9 @@ def fit_in_cache(
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Heights of a small model fitted to the scans, from which a network's first scan terms come."""
+    """Return the heights of a small model fitted to the scans, from which a network's first scan terms
+    come.
+    """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
         fit_small_model(small, scans, config.nuisance, config.free_gain)
@@ -132,7 +134,9 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
 def run_key(
     model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
 ) -> str:
-    """Hash of everything that determines a fit: model, hyper-parameters, settings, scans, predicted scans."""
+    """Return the hash of everything that determines a fit: model, hyper-parameters, settings, scans,
+    predicted scans.
+    """
     record = {
         "held_out_ids": list(held_out_ids),
         "model": model.name,
@@ -144,12 +148,12 @@ def run_key(
 
 
 def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, str]:
-    """The key of each scan by its id."""
+    """Return the key of each scan by its id."""
     return {scan.id: scan_sha256(scan) for scan in scans}
 
 
 def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:
-    """Pitch, level height and number of levels that all scans share.
+    """Return the pitch, level height and number of levels that all scans share.
 
     Raises:
         InputError: no scans, or scans that differ.

@@ -1,6 +1,6 @@
-"""Least squares for all small models: damped Gauss-Newton that also solves for the terms of single scans.
+"""Fit all small models by least squares: damped Gauss-Newton that also solves for the terms of single scans.
 
-The loss is a sum of squares, or of absolute values by the weights 1/sqrt(r² + δ²). The problem provides
+The loss is a sum of squares, or of absolute values with the weights 1/sqrt(r² + δ²). The problem provides
 residuals and derivatives (of a model of the zoo, or of the loop's model with effects), and the ``room`` in
 which the parameters may move.
 """
@@ -19,10 +19,10 @@ from litho_data.foundation.kinds import Array
 Loss = Literal["absolute", "squares"]
 Room = tuple[Array, Array]
 
-# Residuals below this count squared; it is far below the noise of a print (16 nm).
+# Smaller residuals count squared; the limit is far below the noise of a print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# Squared size below which a combination of unit columns is round-off.
+# Below this squared size, a combination of unit columns is rounding error.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
@@ -46,13 +46,13 @@ class Problem(Protocol):
     """The interface of a fit, scan by scan."""
 
     def linearise(self, vector: Array) -> list[Linearised]:
-        """All scans at these parameters."""
+        """Linearise all scans at these parameters."""
 
     def residuals(self, vector: Array) -> list[Array]:
-        """Measured minus predicted (n,) of all scans, µm."""
+        """Return the measured minus predicted heights (n,) of all scans, µm."""
 
     def room(self, vector: Array) -> Room | None:
-        """Smallest and largest step (p,) allowed from here; None if any step is."""
+        """Return the smallest and largest step (p,) allowed from here; None if any step is allowed."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class LeastSquaresFit:
-    """Fitted parameters (p,), the scans at them, and the loss after each step."""
+    """The fitted parameters (p,), the scans linearised at them, and the loss after each step."""
 
     vector: Array
     linear: list[Linearised]
@@ -91,7 +91,9 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` wraps their range."""
+    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` wraps the range of the
+    steps.
+    """
     vector, linear = start, problem.linearise(start)
     if not len(start):
         return LeastSquaresFit(vector, linear, [])
@@ -136,9 +138,10 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Rows of the parameters first, then of the terms of each scan, then those that pin leading terms.
+    """The rows belong first to the parameters, then to the terms of each scan, then to the equations that pin
+    leading terms.
 
-    With ``squares`` the terms of the scans are eliminated and only the parameters are left.
+    With ``squares`` the terms of the scans are eliminated, and only the parameters remain.
     """
 
     matrix: Array
@@ -149,7 +152,7 @@ class NormalEquations:
 
     @classmethod
     def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
-        """The equations at linearised scans with the present ``terms`` (scans, k)."""
+        """Make the equations at linearised scans with the present ``terms`` (scans, k)."""
         count = len(linear[0].jacobian)
         if terms is None:
             matrix, right, squares = eliminated_sum(linear, rules.term_weight)
@@ -172,7 +175,7 @@ class NormalEquations:
         return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
 
     def solve(self, damping: float, room: Room | None) -> tuple[Array, Array]:
-        """Changes of the parameters within their room, and of the terms (scans, k)."""
+        """Return the changes of the parameters within their room, and of the terms (scans, k)."""
         count = self.count
         if room is not None:
             step = solve_damped(*self._parameters_only(), damping, room)
@@ -182,7 +185,7 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # The best terms for the limited step, not for the unlimited one.
+        # These terms are best for the limited step, not for the unlimited one.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -191,7 +194,7 @@ class NormalEquations:
         return step, terms[: scans * each].reshape(scans, each)
 
     def _parameters_only(self) -> tuple[Array, Array]:
-        """The equations with the terms of the scans eliminated."""
+        """Eliminate the terms of the scans from the equations."""
         count = self.count
         if len(self.matrix) == count:
             return self.matrix, self.right
@@ -202,30 +205,34 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Predicted decrease of the squares by a step (p,), from normal equations (p, p), (p,)."""
+    """Return the decrease of the squares that a step (p,) promises, by the normal equations (p, p), (p,)."""
     return float(2 * right @ step - step @ matrix @ step)
 
 
 def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[Linearised]:
-    """All scans with new residuals (n,), µm, and unchanged derivatives."""
+    """Return all scans with new residuals (n,), µm, and unchanged derivatives."""
     return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
-    """Normal matrix, right side and weighted sum of squares of one scan, its own terms eliminated."""
+    """Return normal matrix, right side and weighted sum of squares of one scan, with its own terms
+    eliminated.
+    """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
 
 
 def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Array, Array, float]:
-    """``eliminated``, summed over scans."""
+    """Sum ``eliminated`` over scans."""
     parts = [eliminated(part, term_weight) for part in linear]
     normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
     return normal, right, sum(p[2] for p in parts)
 
 
 def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
-    """Sum of squares of residuals (n,) of these scans, with what their own terms explain weighted down."""
+    """Return the sum of squares of residuals (n,) of these scans; what their own terms explain is weighted
+    down.
+    """
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
         for r, part in zip(residuals, linear, strict=True)
@@ -233,10 +240,10 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 
 
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
-    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
+    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; parameters without effect do no harm.
 
-    If a step were cut to its bounds afterwards, the other parameters would still fit the uncut step, and fits
-    with an optimum on a bound would converge slowly.
+    If a step were only cut to its bounds afterwards, the other parameters would still fit the uncut step, and
+    fits with an optimum on a bound would converge slowly.
 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).
@@ -259,7 +266,7 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
 
 
 def orthonormal(columns: Array) -> Array:
-    """Orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
+    """Return an orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
     if not columns.shape[1]:
         return columns
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
@@ -269,12 +276,14 @@ def orthonormal(columns: Array) -> Array:
 
 
 def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
-    """Inner products (m, m) of the columns (n, m), the part inside the basis (n, k) weighted down."""
+    """Return inner products (m, m) of the columns (n, m), with the part inside the basis (n, k) weighted
+    down.
+    """
     return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
 
 
 def gram_inside(columns: Array, basis: Array) -> Array:
-    """Inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
+    """Return the inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
     inside = basis.T @ columns
     return inside.T @ inside
 

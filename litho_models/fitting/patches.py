@@ -1,4 +1,4 @@
-"""Patches of a store for your own training loop: a PyTorch ``Dataset`` without the lock box."""
+"""Draw patches of a store for your own training loop: a PyTorch ``Dataset`` without the lock box."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from litho_models.fitting.crops import Window, cut
 
 
 class Patch(TypedDict):
-    """One patch: layout with its margin, measured height and which pixels count; its scan and corner."""
+    """One patch: layout with its margin, measured height, which pixels count, its scan and its corner."""
 
     layout_um: Tensor
     height_um: Tensor
@@ -26,12 +26,12 @@ class Patch(TypedDict):
 
 
 class PatchDataset(Dataset[Patch]):
-    """Squares drawn from the scans of a store, each a function of seed and index alone.
+    """Squares drawn from the scans of a store; each depends only on the seed and its index.
 
     ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
-    sees what lies beyond its edge; ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid``
-    (1, s, s) bool says where it counts. Patches are neither turned nor flipped: the two axes of a print are
-    not alike, and a lag of the beam or of the microscope acts to one side.
+    sees what lies beyond its edge. ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid`` (1,
+    s, s) bool marks the pixels that count. Patches are neither turned nor flipped, because the two axes of a
+    print differ, and a lag of the beam or of the microscope acts to one side.
 
     Args:
         store: dataset store or its path. Locked scans are left out.
@@ -66,7 +66,7 @@ class PatchDataset(Dataset[Patch]):
 
     @property
     def ids(self) -> list[str]:
-        """The scans that patches are drawn from."""
+        """Return the scans from which patches are drawn."""
         return [scan.id for scan in self._scans]
 
     def __len__(self) -> int:

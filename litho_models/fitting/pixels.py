@@ -1,4 +1,4 @@
-"""Networks of fixed features, fitted to single pixels: features are computed once for each scan."""
+"""Fit networks of fixed features to single pixels; the features are computed once for each scan."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,15 +20,17 @@ from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
-# Fitted pixels of all scans together, on a square grid in each: 100 MB of features.
+# Number of fitted pixels of all scans together, on a square grid in each: 100 MB of features.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
-# Passes over all pixels between estimates of the scan terms.
+# Number of passes over all pixels between estimates of the scan terms.
 EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """One scan: features (n, all), measured height minus the chain's (n,) µm, and its own terms (m, n)."""
+    """One scan: features (n, all), measured height minus the chain's (n,) µm, and the scan's own terms (m,
+    n).
+    """
 
     features: Tensor
     rest_um: FloatMap
@@ -38,9 +40,9 @@ class _Pixels(NamedTuple):
 def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
-    """Fit the feature networks of ``model`` in place, by mean absolute error, to the chain's residual.
+    """Fit the feature networks of ``model`` in place to the chain's residual, by mean absolute error.
 
-    Offsets of lines are left out of the terms of the scans, as they average out.
+    Line offsets are left out of the terms of the scans, because they average out.
 
     Returns:
         the record of one round, with the error after the terms of the scans are removed; ``validation``
@@ -95,7 +97,7 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """Targets of the networks at all pixels, (all n,) µm, without the scan terms."""
+    """Return the targets of the networks at all pixels, (all n,) µm, without the scan terms."""
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]
     own = np.array([least_squares(part.terms, rest) for part, rest in zip(parts, rests, strict=True)])

@@ -1,4 +1,4 @@
-"""The processes of ``torchrun``, which share a training; without it there is one."""
+"""The processes of ``torchrun`` that share a training; without torchrun there is one process."""
 
 import os
 from collections.abc import Iterable
@@ -9,10 +9,11 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Join the processes of torchrun, over gloo for processors and NCCL for GPUs, each with its own GPU.
+    """Join the processes of torchrun, over gloo for processors and NCCL for GPUs, where each process has its
+    own GPU.
 
     Returns:
-        the number of this process, from 0, and how many there are.
+        The number of this process, from 0, and how many processes there are.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return 0, 1
@@ -24,7 +25,7 @@ def joined() -> tuple[int, int]:
 
 
 def add_over_processes(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over the processes, which must give them in one order."""
+    """Replace each tensor by its sum over the processes, which must pass the tensors in the same order."""
     if joined()[1] > 1:
         for tensor in tensors:
             dist.all_reduce(tensor)

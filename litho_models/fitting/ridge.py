@@ -14,18 +14,19 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Relative to the mean square of each feature, the scans' own terms removed: it only affects weights that the
-# scans cannot tell apart. On the measured prints all values from 1e-6 to 1e-4 give the same.
+# Relative to the mean square of each feature after the scans' own terms are removed. It affects only weights
+# that the scans cannot distinguish. On the measured prints all values from 1e-6 to 1e-4 give the same result.
 RIDGE = 1e-5
-# Fitted pixels of each scan, on a square grid: twice as many predict the measured prints equally well. The
-# rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take at most KEPT_BYTES,
-# and computed again in each pass otherwise; the maps of one tile take another 0.3 GB.
+# Number of fitted pixels of each scan, on a square grid; twice as many predict the measured prints equally
+# well. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take at most
+# KEPT_BYTES; otherwise each pass computes them again. The maps of one tile take another 0.3 GB.
 FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
-# The first pass minimises squares; the second reweights them to absolute values, so that blobs weigh little.
+# The first pass minimises squares; the second reweights them to absolute values, so that blobs have little
+# weight.
 PASSES = 2
-# Weight of the scan terms, which determines the common datum.
+# Weight of the scan terms; it determines the common datum.
 _TERM_WEIGHT = 1e-3
 
 
@@ -70,14 +71,16 @@ def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
 
 
 def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, FloatMap, FloatMap]:
-    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted pixels."""
+    """Return features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted
+    pixels.
+    """
     at = grid_pixels(scan, FITTED_PX)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
     return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
-    """Features (k, n) at flat indices ``at`` of a scan, made tile by tile."""
+    """Return features (k, n) at flat indices ``at`` of a scan, computed tile by tile."""
     reach = model.reach_px
     layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)
     place = np.stack(np.divmod(at, scan.shape[1]))

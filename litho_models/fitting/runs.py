@@ -1,4 +1,4 @@
-"""Run folders: train a model on a store, resumable."""
+"""Train a model on a store in a run folder; interrupted runs resume."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -33,7 +33,7 @@ CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(Result):
-    """``run.json``: the record of a training."""
+    """The record of a training, ``run.json``."""
 
     SCHEMA: ClassVar[str] = "litho-models/run/1"
     FILE_NAME: ClassVar[str] = "run.json"
@@ -133,7 +133,7 @@ def train(
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """The checked settings of a recipe; settings unknown to training go to the model.
+    """Return the checked settings of a recipe; settings unknown to training go to the model.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.
@@ -153,13 +153,13 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Share of pixels printed with each level."""
+    """Return the share of pixels printed with each level."""
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Share of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
+    """Return the share of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )

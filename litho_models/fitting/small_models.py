@@ -18,11 +18,11 @@ from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
-# A quarter of each scan is enough for a small model; the quadrant changes from scan to scan.
+# A quarter of each scan is enough for a small model; successive scans use different quadrants.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Largest step. Parameters are heights in µm and raw numbers of ranges, for which larger steps leave the
-# region of a valid linearisation.
+# Largest step of a parameter. Parameters are heights in µm and raw numbers of ranges, for which larger steps
+# leave the region of a valid linearisation.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
@@ -32,10 +32,11 @@ def fit_small_model(
 ) -> list[float]:
     """Fit ``model`` in place to the mean absolute error, on every second row and column of a window per scan.
 
-    Line offsets of ``full+rows`` are left out: they average out over a scan and cannot move a small model.
+    Line offsets of ``full+rows`` are left out, because they average out over a scan and hardly affect a small
+    model.
 
     Returns:
-        mean absolute residual after each step, µm, the terms of the scans removed.
+        The mean absolute residual after each step, µm, with the terms of the scans removed.
     """
     if not any(parameter.requires_grad for parameter in model.parameters()):
         return []
@@ -48,7 +49,7 @@ def fit_small_model(
 
 
 class ModelProblem:
-    """A model on windows of scans; it works on its own copy of the model.
+    """A model on windows of scans; the problem works on its own copy of the model.
 
     Args:
         model: the model; ``scans``: training scans; ``terms``: free terms of each scan.
@@ -60,22 +61,24 @@ class ModelProblem:
         self._terms = terms
 
     def linearise(self, vector: Array) -> list[Linearised]:
-        """All scans at these parameters."""
+        """Linearise all scans at these parameters."""
         _load(self._model, vector)
         return [sample.linearise(self._model, self._terms) for sample in self._samples]
 
     def residuals(self, vector: Array) -> list[Array]:
-        """Measured minus predicted of all scans, µm."""
+        """Return the measured minus predicted heights of all scans, µm."""
         _load(self._model, vector)
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
     def room(self, vector: Array) -> Room | None:
-        """Steps within the ranges of the model; a linear model may take any step."""
+        """Return the steps within the ranges of the model; a linear model may take any step."""
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
-    """Smallest and largest step (p,) of a model's trainable numbers: their ranges and ``STEP_LIMIT``."""
+    """Return the smallest and largest step (p,) of a model's trainable numbers: their ranges and
+    ``STEP_LIMIT``.
+    """
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)
     ends = [
@@ -105,7 +108,7 @@ class _Sample:
         self._expansion: tuple[Array, Array, Array] | None = None
 
     def linearise(self, model: Simulator, terms: Terms) -> Linearised:
-        """The scan, linearised at the model's present values; a linear model is differentiated once."""
+        """Linearise the scan at the model's present values; a linear model is differentiated only once."""
         if model.is_linear and self._expansion is not None:
             height, jacobian = self.height_um(model), self._expansion[2]
         else:
@@ -116,7 +119,7 @@ class _Sample:
         return Linearised(self.residual(height), self._thinned(jacobian), basis)
 
     def height_um(self, model: Simulator) -> Array:
-        """Height of the window (y, x), µm, float64."""
+        """Return the height of the window (y, x), µm, float64."""
         if model.is_linear and self._expansion is not None:
             here, value, jacobian = self._expansion
             return value + np.tensordot(_vector(model) - here, jacobian, axes=1)
@@ -124,13 +127,13 @@ class _Sample:
             return self.predict(model).double().numpy()
 
     def predict(self, model: Simulator) -> Tensor:
-        """Height of the window, (y, x) µm, its surroundings taken into account."""
+        """Predict the height of the window, (y, x) µm, with its surroundings."""
         if model.reach_px is None:
             return model(stack([self._layout_um], [self._window]))[0, 0]
         return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
 
     def residual(self, height_um: Array) -> Array:
-        """Measured minus predicted at the used pixels, µm."""
+        """Return measured minus predicted heights at the used pixels, µm."""
         return self._height - self._thinned(height_um)
 
     def _thinned(self, fields: Array) -> Array:
@@ -138,7 +141,9 @@ class _Sample:
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> Array:
-    """Derivatives (parameters, y, x) of the window, float64: in forward mode, all parameters in one pass."""
+    """Return the derivatives (parameters, y, x) of the window, float64, for all parameters in one
+    forward-mode pass.
+    """
     prediction = _WindowPrediction(model, sample)
     named = {f"model.{name}": one for name, one in model.named_parameters() if one.requires_grad}
     sizes = [parameter.numel() for parameter in named.values()]
@@ -166,7 +171,7 @@ def _load(model: Simulator, vector: Array) -> None:
 
 
 class _WindowPrediction(nn.Module):
-    """``sample.predict`` as a module, the form in which torch swaps parameters for tangents."""
+    """``sample.predict`` as a module, because torch can swap parameters for tangents only in modules."""
 
     def __init__(self, model: Simulator, sample: _Sample):
         super().__init__()

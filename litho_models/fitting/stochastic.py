@@ -3,7 +3,7 @@
 Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
 scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
 and step, so an interrupted run continues to the same result. Processes share the crops of each step and add
-their gradients. Between rounds each process does the same.
+their gradients. Between rounds every process computes the same.
 """
 
 import math
@@ -45,9 +45,9 @@ def train_network(
 ) -> list[RoundRecord]:
     """Train ``model`` in place, on a GPU if there is one; it ends with the weights of the best round.
 
-    The best round is that with the smallest error on ``validation``, without validation scans the last one.
-    ``first_predictions_um`` makes the heights of a small model on the training scans, from which the first
-    scan terms are estimated; a run that continues does not call it.
+    The best round is the one with the smallest error on ``validation``; without validation scans it is the
+    last. ``first_predictions_um`` computes the heights of a small model on the training scans, from which the
+    first scan terms are estimated. A run that continues does not call it.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -115,7 +115,8 @@ def _diverged(model: Simulator, step: int) -> InputError:
 
 
 class _Targets:
-    """Layouts of the training scans, their heights free of scan terms; what is not measured has no weight.
+    """The layouts of the training scans, and their heights without scan terms; unmeasured pixels have no
+    weight.
 
     Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
     """
@@ -134,7 +135,7 @@ class _Targets:
 def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
-    """Do one step; return (2,): weighted absolute error, µm, and weight; a GPU may still be computing it."""
+    """Do one step; return (2,): weighted absolute error, µm, and weight. A GPU may still be computing it."""
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
@@ -142,7 +143,7 @@ def _step(
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    # A process without a crop of its own has the gradients of one with weight 0.
+    # A process without a crop of its own uses the gradients of a crop with weight 0.
     for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
         share = len(some) / len(batch) if own else 0.0
@@ -156,12 +157,13 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,).
+    """Return the loss of some windows and, for the record, the weighted absolute error, µm, and the weight,
+    (2,).
 
-    Random crops come with their surroundings or are one tile of the model; quadrants are images of their own.
+    A random crop includes its surroundings or is one tile of the model; a quadrant is an image of its own.
     """
     tile = model.tile if config.crops == "random" else None
-    # It changes in training if a blur learns its width.
+    # The reach changes in training if a blur learns its width.
     reach = model.reach_px if config.crops == "random" else None
     predict = model if tile is None and reach is None else model.interior
     layout, height, weight = (
@@ -172,14 +174,14 @@ def _losses(
             (targets.weights, 0),
         )
     )
-    # Layouts and heights are float32 whatever the precision within.
+    # Layouts and heights are float32, whatever the precision inside the network.
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # Each pixel has its weight in the blended field.
+        # Each pixel has the weight that it has in the blended field.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # A mean over all pixels, valid or not, so crops count equally in groups of any size.
+    # The mean is over all pixels, valid or not, so that crops count equally in groups of any size.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 
@@ -188,7 +190,7 @@ def _crops(
     fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int, device: torch.device
 ) -> Tensor:
     crops = stack(fields, windows, margin_px)
-    # A copy from pinned memory does not wait for the GPU's running work.
+    # A copy from pinned memory does not wait for the work that the GPU is doing.
     return crops.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else crops.to(device)
 
 
@@ -197,7 +199,9 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Pixels that tiles may reach beyond a scan: as far as in prediction, and one tile at least."""
+    """Return how many pixels tiles may reach beyond a scan: as far as in prediction, and at least one
+    tile.
+    """
     if model.tile is None or config.crops != "random":
         return 0
     shortest = min(length for scan in scans for length in scan.shape)
@@ -205,7 +209,9 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Rate of one step: constant, or up along a cosine for a tenth of the steps and down for the rest."""
+    """Return the rate of one step: constant, or up along a cosine for a tenth of the steps and down for the
+    rest.
+    """
     if config.schedule == "constant":
         return config.learning_rate
     done = (step + 0.5) / config.steps
@@ -217,7 +223,7 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 
 def validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
-    """Mean datum-free error over scans, nm; None without scans."""
+    """Return the mean datum-free error over scans, nm; None without scans."""
     return mean_error_nm(scans, (predict_scan(model, scan) for scan in scans)) if scans else None
 
 

@@ -16,14 +16,14 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
-# How a figure was scored: on training scans, or on held-out scans.
+# How an error was scored: on training scans, or on held-out scans.
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
 # The side to which an effect of undetermined role is attributed.
 Attribution = Literal["printer", "microscope"]
 
-# Lists that are looked up in `training` and `split`; everything else there is free-form.
+# These lists are looked up in `training` and `split`; everything else there is free-form.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
@@ -43,7 +43,7 @@ class CardMetric(Record):
 
     @property
     def text(self) -> str:
-        """The figure and its interval."""
+        """Format the error with its interval."""
         between = f" ({self.ci95[0]:.2f} … {self.ci95[1]:.2f})" if self.ci95 else ""
         return f"{self.value:.2f} {self.unit}{between}"
 
@@ -53,10 +53,10 @@ class ModelCard(RunFacts, Result):
 
     ``background`` is the mean contribution of the microscope to the training scans. It is used only for
     comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each fitted
-    value on a bound of its range to that bound. ``baseline``: the figures (``ScanFigures``) of the scans that
-    the model was made of, with which ``litho-models check`` compares new prints. ``attributed`` says to which
-    side each effect of undetermined role was attributed when the model was frozen; older cards list those of
-    the printer in ``declared_processes``.
+    value on a bound of its range to that bound. ``baseline`` contains the figures (``ScanFigures``) of the
+    scans from which the model was made; ``litho-models check`` compares new prints with them. ``attributed``
+    says to which side each effect of undetermined role was attributed when the model was frozen; older cards
+    list those of the printer in ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -99,7 +99,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def held_out(self) -> CardMetric | None:
-        """The error on held-out scans; None for a model outside any benchmark."""
+        """Return the error on held-out scans; None for a model outside any benchmark."""
         return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 
     @field_validator("training", "split")
@@ -135,7 +135,7 @@ class ModelCard(RunFacts, Result):
 
     @property
     def page(self) -> str:
-        """The card as Markdown with a Hugging Face front matter."""
+        """Return the card as Markdown with a Hugging Face front matter."""
         page = Path(__file__).with_name("readme.md.jinja")
         return filled(page, card=self, bounds=bounds_text(self.at_bounds))
 

@@ -29,10 +29,11 @@ _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um"
 
 
 def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) -> float:
-    """Write a frozen model as a program for layouts of one size; returns the largest difference, µm.
+    """Write a frozen model as a program for layouts of one size; return the largest difference, µm.
 
-    The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. It checks
-    neither pitch nor range; its metadata has both (``card.json`` of a ``.pt2``, ``metadata_props`` of ONNX).
+    The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. The program
+    checks neither pitch nor range. Its metadata contains both (``card.json`` of a ``.pt2``,
+    ``metadata_props`` of ONNX).
 
     Args:
         out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
@@ -66,10 +67,10 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 
 
 class _Numbers(TorchDispatchMode):
-    """Python numbers that a model reads from tensors, recorded in one run and replayed in another.
+    """The Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
     They are the radii of kernels, which follow from widths, and the ends of tables. Both follow from the
-    weights alone, so a program may hold them as constants.
+    weights alone, so a program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):
@@ -131,7 +132,7 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
         raise InputError(
             "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
         ) from None
-    # The exporter warns of packages that no model here needs.
+    # The exporter warns about packages that no model here needs.
     with quiet("torch.onnx", "onnxscript", "onnx_ir", above=logging.WARNING):
         try:
             written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)

@@ -1,4 +1,4 @@
-"""Frozen models: a folder of weights and a plain card, written once, loaded without running anything.
+"""Frozen models as folders of weights and a plain card, written once and loaded without running anything.
 
 ``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card for people.
 Only numbers and names of known classes are read; nothing is unpickled.
@@ -41,7 +41,7 @@ def save_frozen(
     process_effects: EffectValues | None = None,
     **card_fields: Any,
 ) -> Path:
-    """Write a process model for design; returns the folder.
+    """Write a process model for design; return the folder.
 
     Args:
         simulator: the fitted model.
@@ -58,7 +58,8 @@ def save_frozen(
     _check_numbers(state, f"weights of {simulator.name}")
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
-        # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
+        # The file has no metadata, because safetensors writes its entries in no fixed order, which would
+        # change the hash.
         (temporary / WEIGHTS_FILE).write_bytes(save(state))
         try:
             own = {
@@ -85,7 +86,7 @@ def save_frozen(
 def load_frozen(
     source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
-    """Load a frozen model: eval mode, weights without gradients, effects of the printer included.
+    """Load a frozen model in eval mode, with weights without gradients, including its effects of the printer.
 
     Args:
         source: what ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for one that ``push`` shared.
@@ -110,7 +111,7 @@ def load_frozen(
 
 
 def push(source: str | Path, repository: str, *, private: bool = False) -> str:
-    """Share a frozen model on the Hugging Face Hub; returns the address that ``load_frozen`` takes.
+    """Share a frozen model on the Hugging Face Hub; return the address that ``load_frozen`` takes.
 
     Args:
         source: as for ``load_frozen``.
@@ -124,7 +125,7 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
 
 
 def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
-    """The base model of a frozen folder without its effects, weights checked against the card.
+    """Load the base model of a frozen folder without its effects, and check its weights against the card.
 
     Raises:
         InputError: weights missing, damaged, or of another model than the card says.
@@ -176,7 +177,8 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     try:
         return known(config)
     except (ArithmeticError, ValueError) as error:
-        # Each value is in its range, but not together with others, such as a start beyond its upper bound.
+        # Each value is in its range, but some values do not fit together, such as a start beyond its upper
+        # bound.
         raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
 
 
@@ -188,7 +190,7 @@ def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
 
 
 def _check_effects(card: ModelCard) -> None:
-    """Refuse names that are no process effects, and values that no printer can have."""
+    """Refuse names that are not process effects, and values that no printer can have."""
     from litho_models.effects import get_effect
 
     for name, values in card.process_effects.items():

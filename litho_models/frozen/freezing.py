@@ -9,9 +9,9 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE, Attribution, ModelCard
 from litho_models.frozen.files import load_simulator, save_frozen
 
-# Folders of the model in the run folders of `train` and `close-loop`.
+# Folder of the model in the run folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
-# Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
+# Name of the part that `Simulator.printer` leaves out, among the effects of undetermined role.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
     f"Stated errors are those with {SCAN_AXIS}, which belongs to measured maps and is left out here."

@@ -1,4 +1,4 @@
-"""Frozen models on the Hugging Face Hub: a repository of three files, fetched or shared."""
+"""Fetch or share frozen models on the Hugging Face Hub: each is a repository of three files."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """The folder of a model, fetched unless the cache of huggingface_hub holds it.
+    """Return the folder of a model; it is fetched unless the cache of huggingface_hub contains it.
 
     Args:
         address: ``hf://owner/name``, or ``hf://owner/name@revision``.
@@ -28,7 +28,7 @@ def fetched(address: str) -> Path:
 
 
 def upload(folder: Path, repository: str, *, private: bool) -> str:
-    """Make the repository if need be and put the three files of a frozen model into it; its address.
+    """Make the repository if necessary and put the three files of a frozen model into it; return its address.
 
     Raises:
         InputError: no such address, a repository that refuses, or no huggingface_hub.
@@ -42,7 +42,7 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
 
 @contextmanager
 def _hub(repository: str) -> Iterator[Any]:
-    """The library; each of its errors becomes one line."""
+    """Yield the library, and turn each of its errors into one line."""
     what = f"model {ADDRESS}{repository}"
     if not _REPOSITORY.fullmatch(repository):
         raise InputError(what, wanted=f"{ADDRESS}OWNER/NAME")
@@ -52,6 +52,6 @@ def _hub(repository: str) -> Iterator[Any]:
         raise InputError(what, got=f"no {error.name}", hint="pip install 'litholoop[hub]'") from None
     try:
         yield huggingface_hub
-    # Its own errors, and those of whatever network library it uses.
+    # These are its own errors, and those of whatever network library it uses.
     except Exception as error:
         raise InputError(what, got=str(error).strip().partition("\n")[0]) from error

@@ -1,4 +1,4 @@
-"""Apply a frozen model to a file of levels or to a store, and find the scans that it has seen."""
+"""Apply a frozen model to a file of levels or to a store, and find the scans on which it was trained."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,8 @@ from litho_models.scan_terms.background import Background
 
 
 def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) -> np.ndarray:
-    """Predict the print of a layout of levels and write its height to ``out``; returns it, (ny, nx) µm.
+    """Predict the print of a layout of levels, and write its height to ``out``; return the height, (ny, nx)
+    µm.
 
     Args:
         layout: TIFF, PNG, BMP or NPY of integer levels or of their grey values, sampled at the model's pitch;
@@ -33,33 +34,33 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
-    """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
+    """Predict the height of a scan with a frozen model, float32 (ny, nx) µm."""
     model.check_geometry(scan.pitch_um, scan.level_height_um)
     return model.predict(scan.layout_um)
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
-    """The background in a model's card, if it has one for scans of this size."""
+    """Return the background in a model's card, if the card has one for scans of this size."""
     stated = model.card["background"]
     learned = Background.model_validate(stated) if stated is not None else None
     return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
 
 
 def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
-    """The scans on which the model was trained; none if it was made from other prints."""
+    """Return the scans on which the model was trained; none if it was made from other prints."""
     return set(model.card["training"].get("scan_ids", [])) if made_of_these_prints(model, dataset) else set()
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Whether a model was made from the prints in a store: the same dataset, or the same locked scans in
-    it.
+    """Return whether a model was made from the prints in a store: the same dataset, or the same locked scans
+    in it.
     """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
 
 
 def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
-    """The scans of a store that were locked when the model was made, by their raw files.
+    """Return the scans of a store that were locked when the model was made, identified by their raw files.
 
     Another recipe or registration changes every height of a store, and an added or missing scan changes which
     scans it locks, but neither changes a raw file. If a card lists no files, the ids of its lock box are

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# Rounded to float32, the highest level may exceed the range a little; the next one exceeds it by 100 nm.
+# Rounded to float32, the highest level may exceed the range a little; the next level exceeds it by 100 nm.
 _ROUNDING_UM = 1e-5
 
 
@@ -31,7 +31,7 @@ Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
 
 
 class FrozenSimulator(nn.Module):
-    """A process model for design: fixed weights, gradients to its input only.
+    """A process model for design, with fixed weights and gradients only to its input.
 
     ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
     """
@@ -50,24 +50,24 @@ class FrozenSimulator(nn.Module):
 
     @property
     def name(self) -> str:
-        """Name in the card."""
+        """Return the name in the card."""
         return self.card["name"]
 
     @property
     def pitch_um(self) -> float:
-        """Lateral sampling that the model is made for, µm."""
+        """Return the lateral sampling for which the model is made, µm."""
         return self.card["pitch_um"]
 
     @property
     def tile(self) -> Tile | None:
-        """The tile of a model whose result depends on the size of the image; None for all others."""
+        """Return the tile of a model whose result depends on the size of the image; None for all others."""
         return self.simulator.tile
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
         """Print in ``precision`` inside the block, see ``network_precision``; float32 otherwise.
 
-        One line on stderr says where that is slower than float32.
+        One line on stderr says whether that is slower than float32.
         """
         warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
         before, self._precision = self._precision, precision
@@ -77,13 +77,13 @@ class FrozenSimulator(nn.Module):
             self._precision = before
 
     def train(self, mode: bool = True) -> FrozenSimulator:
-        """Frozen models stay in eval mode."""
+        """Return the frozen models stay in eval mode."""
         return super().train(False)
 
     def forward(
         self, layout_um: Tensor, pitch_um: float | None = None, level_height_um: float | None = None
     ) -> Tensor:
-        """Printed height (b, 1, y, x), µm.
+        """Print a layout; return the height (b, 1, y, x), µm.
 
         Args:
             layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
@@ -100,7 +100,8 @@ class FrozenSimulator(nn.Module):
         return self._in_precision(self.simulator, layout_um)
 
     def predict(self, layout_um: Field, pitch_um: float | None = None) -> Field:
-        """Printed height of a layout of any kind and number of dimensions: the same kind and shape, µm.
+        """Print a layout of any kind and number of dimensions; return the height in the same kind and shape,
+        µm.
 
         Args:
             layout_um: nominal height (..., y, x), µm, of any float type: an array of NumPy or xarray (whose
@@ -139,7 +140,7 @@ class FrozenSimulator(nn.Module):
             raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), none of them 0")
         dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
         fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
-        # One field after the other, so that a stack needs no more memory than one field.
+        # Fields are printed one after the other, so that a stack needs no more memory than one field.
         return torch.cat([self(field) for field in fields]).reshape(layout_um.shape)
 
     def __repr__(self) -> str:
@@ -154,7 +155,8 @@ class FrozenSimulator(nn.Module):
         return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
-        """As ``forward`` without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border) µm.
+        """Print as ``forward`` does, without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border)
+        µm.
 
         With a border at least as wide as the receptive radius, or with a model on tiles, only what the result
         needs is computed. In the first case nothing is assumed beyond the edge of the layout.
@@ -204,7 +206,7 @@ class FrozenSimulator(nn.Module):
             self._check_range(layout_um)
 
     def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
-        """Refuse another pitch or level height than the model's; None is not checked.
+        """Refuse a pitch or level height other than the model's; None is not checked.
 
         Raises:
             InputError: they differ.
@@ -234,7 +236,7 @@ def _check_sampling(layout_um: xr.DataArray, pitch_um: float) -> None:
     for name in ("y_um", "x_um"):
         if name in layout_um.coords:
             steps = np.diff(layout_um[name].to_numpy())
-            # A millionth of a pixel: rounding of positions across a millimetre.
+            # A millionth of a pixel allows for rounding of positions across a millimetre.
             if not np.allclose(steps, pitch_um, rtol=1e-6, atol=0):
                 got = f"steps of {steps.min():g} to {steps.max():g} µm"
                 raise InputError(f"{name} of the layout", got=got, wanted=f"{pitch_um:g} µm")

@@ -1,6 +1,7 @@
-"""Names and folders of the frozen models in the package: the models of the benchmark's table.
+"""Names and folders of the frozen models in the package, which are the models of the benchmark's table.
 
-``load_frozen("zoo:pbl")`` opens one, ``load_frozen("zoo:best")`` the one that predicts held-out scans best.
+``load_frozen("zoo:pbl")`` opens one of them, and ``load_frozen("zoo:best")`` the one that predicts held-out
+scans best.
 """
 
 import builtins
@@ -19,12 +20,13 @@ _CARD_FILE = "card.json"
 
 
 def list(root: str | Path = ZOO_FOLDER) -> builtins.list[str]:
-    """Names of the models in the zoo, sorted; empty where none is shipped."""
+    """Return the sorted names of the models in the zoo; empty if the package contains none."""
     return sorted(card.parent.name for card in Path(root).glob(f"*/{_CARD_FILE}"))
 
 
 def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
-    """The frozen model of that name, or the best one, for commands that take a folder.
+    """Return the folder of the frozen model of that name, or of the best one, for commands that take a
+    folder.
 
     Raises:
         InputError: no such model.
@@ -39,7 +41,7 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
-    """The folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
+    """Return the folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
 
     Args:
         source: what the user typed.
@@ -60,7 +62,8 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
 
 def card(name: str, root: str | Path = ZOO_FOLDER) -> dict[str, Any]:
-    """The card of a zoo model as a dictionary, with the keys of ``ModelCard``; the weights are not read.
+    """Return the card of a zoo model as a dictionary, with the keys of ``ModelCard``; the weights are not
+    read.
 
     Raises:
         InputError: no such model.
@@ -70,6 +73,6 @@ def card(name: str, root: str | Path = ZOO_FOLDER) -> dict[str, Any]:
 
 
 def _held_out_nm(name: str, root: str | Path) -> float:
-    """The first figure of a card: the error on held-out scans."""
+    """Return the first figure of a card: the error on held-out scans."""
     metrics = card(name, root)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")

@@ -1,4 +1,4 @@
-"""Whether a printer still behaves as its frozen model says."""
+"""Check whether a printer still behaves as its frozen model says."""
 
 from litho_models.monitoring.check import check
 from litho_models.monitoring.prints import Check

@@ -4,10 +4,10 @@ Each new print is tried as the first after a step that lasts to the last print. 
 compares the figures before the step, including the reference, with those after it. The t distribution holds
 for any number of reference prints, with unknown mean and spread. This is the likelihood ratio for a step in
 the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The comparisons
-share the rate of false alarms, so it holds for the whole set, whatever their correlation (Bonferroni). A step
-should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step get
-most of the rate. With three new prints the rule is nearly the t test of their mean, the best possible test
-for an unknown spread.
+share the rate of false alarms, so this rate holds for the whole set, whatever their correlation (Bonferroni).
+A step should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step
+get most of the rate. With three new prints the rule is nearly the t test of their mean, the best possible
+test for an unknown spread.
 """
 
 from typing import NamedTuple
@@ -19,11 +19,11 @@ from scipy.stats import t as student
 
 from litho_data.foundation.kinds import Array
 
-# Prints within which a step is to be noticed.
+# Number of prints within which a step should be noticed.
 SOON = 3
 # Share of the rate for each comparison with fewer than ``SOON`` prints from the step on.
 _YOUNG = 0.1
-# Steps of more standard errors are not searched for.
+# Steps larger than this, in standard errors, are not searched for.
 _LARGEST = 1e4
 
 
@@ -55,19 +55,21 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Share of the rate of each comparison, by its first changed print, (m,); they add up to 1."""
+    """Return the share of the rate for each comparison, by its first changed print, (m,); the shares add up
+    to 1.
+    """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
     return np.concatenate([np.full(old, (1 - young * _YOUNG) / old), np.full(young, _YOUNG)])
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """Step and its standard error for every first changed print, (m, ...) each.
+    """Return step and standard error for every first changed print, (m, ...) each.
 
-    Their ratio is a t of n + m - 2 degrees of freedom where nothing has changed.
+    If nothing has changed, their ratio is a t of n + m - 2 degrees of freedom.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
-    # Figures relative to a value within the data: otherwise the sums of squares would lose digits.
+    # Figures are taken relative to a value within the data; otherwise the sums of squares would lose digits.
     centre = np.mean(series.reference, axis=-1, keepdims=True)
     values = np.concatenate([series.reference - centre, series.new - centre], axis=-1)
     n, m = series.reference.shape[-1], series.new.shape[-1]
@@ -83,7 +85,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """The most significant step, and an upper bound of its p.
+    """Find the most significant step, and an upper bound of its p.
 
     Args:
         series: values of shape (n,) and (m,), n at least 2, m at least 1.
@@ -97,9 +99,10 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
-    """Probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if fewer.
+    """Return the probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if
+    fewer.
 
-    A lower bound, by the noncentral t of the one comparison that starts with the rise.
+    The result is a lower bound, by the noncentral t of the one comparison that starts with the rise.
 
     Args:
         step: in units of the (unknown) spread of a figure whose variance here is 1.
@@ -111,7 +114,7 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
-    """The step with this ``chance_to_notice``; infinite beyond ten thousand standard errors."""
+    """Return the step with this ``chance_to_notice``; infinite beyond ten thousand standard errors."""
     error = _comparison(reference_variance, new_variance, rate)[2]
 
     def beyond(errors: float) -> float:
@@ -121,7 +124,9 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
-    """Limit of t, degrees of freedom and standard error of the last ``SOON`` prints against those before."""
+    """Return limit of t, degrees of freedom and standard error for the last ``SOON`` prints against those
+    before.
+    """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)
     before = (1 / reference_variance).sum() + (1 / new_variance[: m - soon]).sum()

@@ -1,4 +1,4 @@
-"""``litho-models check``: test whether a printer still behaves as its frozen model says."""
+"""The function of ``litho-models check``: test whether a printer still behaves as its frozen model says."""
 
 from collections.abc import Sequence
 from pathlib import Path

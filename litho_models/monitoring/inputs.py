@@ -16,14 +16,14 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
-# Heights below half or above twice the predicted ones come from another printer than the model's.
+# Heights below half or above twice the predicted heights come from a printer other than the model's.
 _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
     """Figures of reference and new scans, excluded scans, and a description of the reference.
 
-    ``between``: whether the new prints were made between reference prints.
+    ``between`` says whether the new prints were made between reference prints.
     """
 
     reference: list[ScanFigures]
@@ -36,7 +36,7 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Figures of the new prints and of the reference, of scans of one dose.
+    """Compute the figures of the new prints and of the reference, for scans of one dose.
 
     Raises:
         InputError: more than one reference or none, unknown prints, stores of another geometry or with scans
@@ -76,7 +76,7 @@ def _require_prints(names: Sequence[str], rows: Sequence[ScanFigures], dataset: 
 
 
 def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
-    """Figures of the prints that the model was made of, which are not those of the store."""
+    """Return the figures of the prints from which the model was made, unless they are in the store."""
     hint = "--reference STORE takes the prints of a store, --new PRINT the other prints of this one"
     if not frozen.card["baseline"]:
         raise InputError(
@@ -93,7 +93,7 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
 
 
 def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[ScanFigures]:
-    """Figures of the scans of a store; locked ones of the model's own prints are left out."""
+    """Compute the figures of the scans of a store; locked scans of the model's own prints are left out."""
     seen, locked = trained_ids(frozen, store), set()
     if made_of_these_prints(frozen, store):
         locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
@@ -109,7 +109,7 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """Scans at the dose of most reference scans; other doses change the gain on purpose."""
+    """Keep scans at the dose of most reference scans, because other doses change the gain on purpose."""
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:
         return found

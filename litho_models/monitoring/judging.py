@@ -1,4 +1,4 @@
-"""Judge each figure from the figures of scans, without files or models."""
+"""Judge each figure of scans, without files or models."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -32,11 +32,11 @@ class Trend(NamedTuple):
 
 
 def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, tolerance: float) -> Trend:
-    """Trend over all prints, and the number of prints until it reaches the tolerance.
+    """Fit the trend over all prints, and estimate the number of prints until it reaches the tolerance.
 
-    Drift is the change since the middle of the reference, where the model was made: the trend times the
-    number of prints since. Its 95 % bound follows from the faster end of the trend's interval. A steady
-    drift is assumed; the alarm is for steps.
+    The drift is the change since the middle of the reference, where the model was made: the trend times the
+    number of prints since then. The drift's 95 % bound follows from the faster end of the trend's interval. A
+    steady drift is assumed; the alarm is for steps.
 
     Args:
         values: one per print in printing order, (n,), three at least; ``variance``: relative, (n,).
@@ -70,7 +70,7 @@ def judge(
     figures: Sequence[Figure] = FIGURES,
     between: bool = False,
 ) -> list[FigureCheck]:
-    """Every figure of the new prints against the reference.
+    """Compare every figure of the new prints with the reference.
 
     Args:
         reference, new: scans of prints, in any order; of three reference prints at least.
@@ -86,7 +86,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """Each figure's share of the rate of false alarms."""
+    """Return each figure's share of the rate of false alarms."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

@@ -1,4 +1,4 @@
-"""The record ``check.json`` and its figures: one value per print, and their spread between prints."""
+"""The record ``check.json`` and its figures: one value per print, and the spread of these values."""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
@@ -15,10 +15,10 @@ _LEAST_GAIN = 0.01
 
 
 class Figure(NamedTuple):
-    """A figure that is watched.
+    """A figure that is monitored.
 
-    ``of``: logarithm of its value for one scan, so differences are relative: a step of 0.03 is 3 %.
-    ``weight``: its part of the rate of false alarms.
+    ``of`` is the logarithm of its value for one scan, so that differences are relative: a step of 0.03 is 3
+    %. ``weight`` is its part of the rate of false alarms.
     """
 
     name: str
@@ -74,7 +74,9 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Variance of a print's value by its number of scans, relative to that of a usual print; (n,)."""
+        """Return the variance of a print's value by its number of scans, relative to that of a usual print;
+        (n,).
+        """
         if self.within is None:
             return np.ones(len(counts))
         variance = self.between + self.within / counts
@@ -82,7 +84,7 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """The prints in printing order, by the first scan of each."""
+    """Return the prints in printing order, by the first scan of each."""
     first: dict[str, tuple[int, str]] = {}
     for row in rows:
         first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
@@ -90,7 +92,7 @@ def in_order(rows: Sequence[ScanFigures]) -> list[str]:
 
 
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
-    """The value of each print, in printing order."""
+    """Return the value of each print, in printing order."""
     names = in_order(rows)
     of_print = [[figure.of(row) for row in rows if row.print == name] for name in names]
     return PrintValues(
@@ -99,10 +101,11 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 
 
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
-    """Mean and spread over prints, two at least; variance components by one-way analysis of variance.
+    """Compute mean and spread over at least two prints, with variance components by one-way analysis of
+    variance.
 
-    A print with one scan varies more than one with four. Prints with several scans tell how much of it
-    comes from the scans; a negative variance between prints counts as 0.
+    A print with one scan varies more than a print with four. Prints with several scans show how much of the
+    variation comes from the scans. A negative variance between prints counts as 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -115,13 +118,13 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     if scans == n:
         return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
     within = rest / (scans - n)
-    # The variance of the means of prints is that between prints plus the mean part of the scans.
+    # The variance of the means of prints is the variance between prints plus the mean part of the scans.
     between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
 
 class CheckedModel(Record):
-    """Name and hash of the model, and the dataset it was made of."""
+    """Name and hash of the model, and the dataset from which it was made."""
 
     name: str
     sha256: str
@@ -129,9 +132,9 @@ class CheckedModel(Record):
 
 
 class Alarm(Record):
-    """A step in the mean of a figure, relative; ``since``: the first changed print.
+    """A step in the mean of a figure, relative; ``since`` is the first changed print.
 
-    ``step``: mean from ``since`` on minus the mean before, with an interval that does not allow for the
+    ``step`` is the mean from ``since`` on minus the mean before, with an interval that does not allow for the
     choice of ``since``.
     """
 
@@ -141,13 +144,14 @@ class Alarm(Record):
 
 
 class FigureCheck(Record):
-    """One figure of the new prints against the reference; all but ``mean`` are relative, 0.01 is 1 %.
+    """One figure of the new prints against the reference; all values except ``mean`` are relative, 0.01 is 1
+    %.
 
-    ``mean`` and ``spread``: of the reference prints. ``p``: upper bound of the p of a change; an alarm is
-    raised if it is at most ``alarm_at``, the figure's share of the rate. ``noticeable_step``: the rise r that
-    is noticed within three new prints (or all, if fewer) in 9 of 10 cases, as is a fall by r/(1 + r); None
-    beyond a factor of e. ``trend``: change per print over all prints. ``measure_again_in``: prints until the
-    95 % bound of the drift reaches ``tolerance``.
+    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p of a change.
+    An alarm is raised if it is at most ``alarm_at``, the figure's share of the rate. ``noticeable_step`` is
+    the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10 cases; a fall by r/(1 +
+    r) is noticed equally. It is None beyond a factor of e. ``trend`` is the change per print over all prints.
+    ``measure_again_in`` is the number of prints until the 95 % bound of the drift reaches ``tolerance``.
     """
 
     name: str
@@ -168,9 +172,9 @@ class FigureCheck(Record):
 
 
 class Check(Result):
-    """``check.json``; ``verdict`` is for people, ``alarm`` for machines.
+    """The record ``check.json``; ``verdict`` is for people, ``alarm`` for machines.
 
-    ``false_alarm_rate``: chance that such a data set from an unchanged printer raises an alarm.
+    ``false_alarm_rate`` is the chance that a data set like this from an unchanged printer raises an alarm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/check/2"

@@ -1,4 +1,4 @@
-"""``report.html`` of a check: the verdict, a control chart for each figure, and a table of scans."""
+"""Write ``report.html`` of a check: the verdict, a control chart for each figure, and a table of scans."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _COLUMNS = (
 
 
 def write_check_report(result: Check, out: str | Path) -> Path:
-    """Render the result into ``out``; returns the page."""
+    """Render the result into ``out``; return the page."""
     page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
     page.verdict(result.verdict[0])
     for one in result.figures:
@@ -48,7 +48,9 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
-    """The figure of every print against the reference: dots of prints, small dots of scans, spread, steps."""
+    """Draw the figure of every print against the reference: dots of prints, small dots of scans, spread,
+    steps.
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(8.5, 3.4)
@@ -83,7 +85,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
 
 
 def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
-    """A logarithm of a figure as its difference from the reference mean, %."""
+    """Convert the logarithm of a figure to its difference from the reference mean, %."""
     return 100 * np.expm1(np.asarray(value) - np.log(one.mean))
 
 

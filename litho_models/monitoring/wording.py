@@ -1,4 +1,4 @@
-"""The text of a check, from templates: the verdict and the notes beside it."""
+"""Write the text of a check from templates: the verdict and the notes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,14 +11,14 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# A layout this much flatter, higher or steeper than every reference layout is of another kind.
+# A layout that is this much flatter, higher or steeper than every reference layout is of another kind.
 _OTHER_KIND = 1.1
 # Largest optimism of a fit, in spreads, with which the rate of false alarms still holds.
 _BEARABLE_OPTIMISM = 0.25
 
 
 def verdict(checks: Sequence[FigureCheck], rate: float) -> list[str]:
-    """The verdict in sentences, the most important first."""
+    """Return the verdict in sentences, the most important first."""
     return _sentences("verdict", checks=checks, rate=rate, soon=SOON)
 
 
@@ -28,7 +28,7 @@ def notes(
     checks: Sequence[FigureCheck],
     parameters: int = 0,
 ) -> list[str]:
-    """Notes on the limits of the verdict; ``parameters``: number of parameters of the model."""
+    """Return notes on the limits of the verdict; ``parameters`` is the number of parameters of the model."""
     return _sentences(
         "notes",
         checks=checks,
@@ -45,7 +45,7 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def optimism(reference: Sequence[ScanFigures], parameters: int) -> float:
-    """Relative bias of the error on a fit's own scans: parameters over independent pixels.
+    """Return the relative bias of the error on a fit's own scans: parameters over independent pixels.
 
     Neighbours within a correlation length of the residual count once.
     """
@@ -54,7 +54,7 @@ def optimism(reference: Sequence[ScanFigures], parameters: int) -> float:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Whether the reference's errors are too small to compare errors on unseen prints with."""
+    """Return whether the reference's errors are too small to be compared with errors on unseen prints."""
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))
     return optimism(reference, parameters) > _BEARABLE_OPTIMISM * spread
 

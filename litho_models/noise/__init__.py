@@ -1,4 +1,4 @@
-"""Noise: the error that no model can predict, and the calibration of stated uncertainties."""
+"""Estimate noise, the error that no model can predict, and test the calibration of stated uncertainties."""
 
 from litho_models.noise.analyse import analyse_noise, analyse_noise_of_files
 from litho_models.noise.result import NoiseAnalysis

@@ -1,4 +1,4 @@
-"""``litho-models noise``: estimate the noise of prints from the available measurements."""
+"""The function of ``litho-models noise``: estimate the noise of prints from the available measurements."""
 
 from pathlib import Path
 
@@ -54,7 +54,8 @@ def analyse_noise(
         spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # The matrix also uses locked scans, because it judges no model and a dose often has only one print.
+        # The dose matrix also uses locked scans, because it judges no model and a dose often has only one
+        # print.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [

@@ -24,9 +24,10 @@ _FEWEST_PIXELS = 1000
 
 
 class FlatLevel(Record):
-    """Residual where the layout is flat, pixels of one level: rms and mean absolute value, nm.
+    """The residual of pixels of one level where the layout is flat: rms and mean absolute value, nm.
 
-    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm``: interval of σ over prints.
+    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the interval of σ over
+    prints.
     """
 
     level: int
@@ -40,10 +41,10 @@ class NoiseBudget(Record):
     """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
-    ``flat_texture`` is the texture of the same pixels after policy ``full``, so with line offsets.
+    ``flat_texture`` is the texture of the same pixels after policy ``full``, so it contains line offsets.
     """
 
-    # Older results also have the length of correlation.
+    # Older results also contain the length of correlation.
     model_config = ConfigDict(extra="ignore")
 
     model: str
@@ -74,7 +75,7 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 
 def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
-    """The flat pixels of each level that has enough of them."""
+    """Yield the flat pixels of each level that has enough of them."""
     used = [np.isfinite(own) for own in flat_um]
     level = np.concatenate([scan.mask_level[use] for scan, use in zip(scans, used, strict=True)])
     residual = NM_PER_UM * np.concatenate([own[use] for own, use in zip(flat_um, used, strict=True)])

@@ -1,4 +1,4 @@
-"""Test the calibration of a stated spread on prints outside its fit."""
+"""Test the calibration of a stated spread on prints that its fit has not used."""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -32,19 +32,19 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import pixel_interval, rms
 
 _FOLDS = 5
-# Roughness is correlated over ten pixels and more, so more pixels add no information.
+# Roughness is correlated over ten pixels and more, so more pixels would add no information.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
-# Older results have further figures: of ensembles, and promises for whole scans.
+# Older results contain further figures: of ensembles, and promises for whole scans.
 _OLDER = ConfigDict(extra="ignore")
 
 
 class ScanCalibration(Record):
-    """One scan: likelihood and CRPS (lower is better), coverage at the levels stated, rms of r/σ.
+    """One scan: likelihood and CRPS (lower is better), coverage at the stated levels, rms of r/σ.
 
-    ``ence`` and ``ause`` are shares, 0 is best (see ``spread_scores``).
+    ``ence`` and ``ause`` are shares, where 0 is best (see ``spread_scores``).
     """
 
     model_config = _OLDER
@@ -59,7 +59,7 @@ class ScanCalibration(Record):
 
 
 class Calibration(Record):
-    """A description of the spread, and its calibration on prints outside its fit.
+    """A description of the spread, and its calibration on prints that its fit has not used.
 
     Args:
         name: constant, or by covariates.
@@ -82,9 +82,9 @@ class Calibration(Record):
 
 
 class SigmaBin(Record):
-    """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
+    """The measured and predicted spread, and its coverage, for pixels within one range of one covariate.
 
-    Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group.
+    It has the coverage at 68 and 95 % with 95 % intervals over prints, and ENCE and AUSE within the group.
     """
 
     model_config = _OLDER
@@ -104,10 +104,11 @@ class SigmaBin(Record):
 
 
 class SpreadAnalysis(Record):
-    """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all scans.
+    """The σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, while the model is
+    fitted to all scans.
 
-    ``nuisance``: what the residuals were freed of. ``left_out``: the prints or scans that are left out of
-    each fit to judge it.
+    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` are the prints or scans
+    that each fit leaves out in order to be judged on them.
     """
 
     model_config = _OLDER
@@ -131,7 +132,7 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit a constant and a covariate spread without each print, and judge both on that print.
+    """Fit a constant and a covariate-dependent spread without each print, and judge both on that print.
 
     With fewer than three prints, scans are left out instead. Tails and scale are fitted together.
 
@@ -218,7 +219,7 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Bins of all pixels, of each level, and of equal counts of every other covariate."""
+    """Yield bins of all pixels, of each level, and of equal counts of every other covariate."""
     used = [np.isfinite(residual) for residual in residuals_nm]
 
     def pooled(maps: Sequence[Array]) -> Array:
@@ -262,7 +263,7 @@ def _groups(
     places: Sequence[dict[str, Array]],
     pooled: Callable[[Sequence[Array]], Array],
 ) -> Iterator[tuple[str, float, float, Array]]:
-    """What a group of pixels has in common, from and to which value, and which pixels it has."""
+    """Yield what a group of pixels has in common, from and to which value, and which pixels it has."""
     level = pooled([scan.mask_level for scan in scans])
     yield "all", 0, 0, np.ones(level.size, bool)
     for one in np.unique(level).tolist():
@@ -276,7 +277,7 @@ def _groups(
 
 
 def _sample(residual: Array, seed: int) -> tuple[Array, ...]:
-    """Row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
+    """Return row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:
         scored = np.random.default_rng(seed).choice(scored, _PIXELS_PER_SCAN, replace=False)

@@ -1,7 +1,7 @@
-"""The dose matrix: height, roughness and lost steps against dose, and the recommended dose.
+"""Evaluate the dose matrix: height, roughness and lost steps against dose, and the recommended dose.
 
 This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
-with a dose, of step ladders or any layout with areas of one level wider than the printer's blur.
+that state a dose, of step ladders or of any layout with areas of one level wider than the printer's blur.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Distance from every change of level: four σ of the optical spot, two of a diffusion of 0.5 µm.
+# Distance from every change of level: four σ of the optical spot, or two σ of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step is lost if it prints less than half the usual height of its dose's steps.
+# A step is lost if its height is less than half the usual height of the steps at this dose.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Surroundings still matter beyond the guard, because diffusion reaches up to 2.5 µm.
+# Surroundings still matter beyond this distance, because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
 class LevelHeight(Record):
-    """Printed height of one level above the lowest printed one, pooled over the scans of a dose."""
+    """The printed height of one level above the lowest printed level, pooled over the scans of a dose."""
 
     level: int
     height_nm: float
@@ -62,7 +62,7 @@ class DoseRow(Record):
 
 
 class DoseMatrix(Record):
-    """All doses, ascending, the recommended one, and why."""
+    """All doses, ascending, with the recommended dose and the reason."""
 
     rows: list[DoseRow]
     recommended_dose: float
@@ -71,7 +71,7 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge the doses of all scans with a dose; notes state which doses are not judged, and why.
+    """Judge the doses of all scans that state one; notes say which doses are not judged, and why.
 
     A dose needs three levels with areas wide enough to measure, and a matrix needs two doses. Among the doses
     that lose the fewest steps, the one with the height nearest to nominal is recommended.
@@ -132,7 +132,9 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
-    """Per level mean and sd inside areas of one level; datum, tilt and surroundings of each scan removed."""
+    """Return mean and sd per level inside areas of one level, after datum, tilt and surroundings of each scan
+    are removed.
+    """
     found: dict[int, list[np.ndarray]] = {}
     for scan in scans:
         inside = _plateaus(scan)
@@ -143,7 +145,7 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
         # The fit has a height per level, one tilt, and an effect of the surroundings. Height differences
-        # within the treads separate them.
+        # within the treads separate these.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
         others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
@@ -164,12 +166,14 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
 
 
 def _surroundings(scan: PrintedScan) -> np.ndarray:
-    """Mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx) µm."""
+    """Return the mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx)
+    µm.
+    """
     return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 
 
 def _plateaus(scan: PrintedScan) -> np.ndarray:
-    """Measured pixels (ny, nx) away from all changes of level."""
+    """Return the measured pixels (ny, nx) away from all changes of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * round(_GUARD_UM / scan.pitch_um) + 1
@@ -178,11 +182,11 @@ def _plateaus(scan: PrintedScan) -> np.ndarray:
 
 
 def _run_length(flags: np.ndarray) -> int:
-    """Number of leading True values."""
+    """Return the number of leading True values."""
     return int(np.argmin(flags)) if not flags.all() else len(flags)
 
 
 def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
-    """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
+    """Return the standard deviation within parts, each about its own mean; 0 if no part has two values."""
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

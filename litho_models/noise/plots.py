@@ -1,4 +1,4 @@
-"""Plots of the noise report."""
+"""Draw the plots of the noise report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Each reference scan as a map, freed of its mean; all but steps share a scale."""
+    """Draw each reference scan as a map without its mean; all but steps share a colour scale."""
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
     grid = figure.subplots(1, len(references), squeeze=False)[0]
     rough = [one for one in references if one.use != "steps"]
@@ -40,7 +40,7 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Heights of the levels, and readability against dose; shaded where steps are lost."""
+    """Draw heights of the levels, and readability against dose, shaded where steps are lost."""
     figure = new_figure(8.5, 3.2)
     left, right = figure.subplots(1, 2)
     doses = np.array([row.dose for row in found.rows])
@@ -68,7 +68,7 @@ def dose(found: DoseMatrix) -> Figure:
 
 
 def spread(found: SpreadAnalysis) -> Figure:
-    """Observed (points) and predicted (line) rms of the residual in ranges of each covariate."""
+    """Draw observed (points) and predicted (line) rms of the residual in ranges of each covariate."""
     names = list(dict.fromkeys(row.covariate for row in found.bins if row.covariate != "all"))
     figure = new_figure(2.8 * len(names), 2.9)
     grid = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
@@ -86,7 +86,7 @@ def spread(found: SpreadAnalysis) -> Figure:
 
 
 def calibration(found: SpreadAnalysis) -> Figure:
-    """Coverage of the 90 % interval scan by scan, and the PIT histogram."""
+    """Draw the coverage of the 90 % interval scan by scan, and the PIT histogram."""
     figure = new_figure(9.5, 3.2)
     left, right = figure.subplots(1, 2)
     for number, described in enumerate(found.calibrations):

@@ -1,4 +1,4 @@
-"""Scans for measuring the noise (bare substrate, flat print, steps), and their results."""
+"""Read scans for measuring the noise (bare substrate, flat print, steps), and compute their results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from litho_models.noise.texture import Texture, texture
 from litho_models.scoring.statistics import interval, rms
 
 _SQUARE_WITHIN = 0.01
-# Pixels that two prints of one layout must have in common.
+# Number of pixels that two prints of one layout must have in common.
 _FEWEST_PIXELS = 64
 
 
@@ -40,7 +40,8 @@ class Reference:
 class ReferencePrints(Record):
     """Results of the reference scans: roughness of each surface, of the print alone, and the steps.
 
-    ``textures``: those of substrates and flat prints with square pixels, without a quadratic background.
+    ``textures`` are those of substrates and flat prints with square pixels, without a quadratic
+    background.
     """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
@@ -51,7 +52,7 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """The substrate, flat and step scans of a store, levelled, in their own frame."""
+    """Return the substrate, flat and step scans of a store, levelled, in their own frame."""
     pitches = store.recorded_pitches_um()
     return [
         Reference(
@@ -66,7 +67,9 @@ def store_references(store: Store) -> list[Reference]:
 
 
 def reference_prints(references: Sequence[Reference], level_height_um: float) -> ReferencePrints:
-    """Roughness of substrates and flat prints under both backgrounds, the print alone, and the steps."""
+    """Compute the roughness of substrates and flat prints under both backgrounds, of the print alone, and of
+    the steps.
+    """
 
     def surfaces(use: str) -> list[SurfaceNoise]:
         return [
@@ -98,13 +101,13 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
 
 def _has_texture(one: Reference) -> bool:
-    """Whether a scan has enough lines, on square pixels."""
+    """Return whether a scan has enough lines, on square pixels."""
     pitch_y_um, pitch_x_um = one.pitch_um
     return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
 
 
 class RepeatedPrints(Record):
-    """Noise of one print, nm, by print, microscope and, at edges, registration.
+    """The noise of one print, nm, that comes from print, microscope and, at edges, registration.
 
     A polynomial of second degree is removed from each pair, so datum, tilt and bow are not included. Errors
     that repeat from print to print are not included either. ``ci95_nm`` resamples pairs.
@@ -117,7 +120,7 @@ class RepeatedPrints(Record):
 
 
 def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
-    """Half the variance between prints of one layout at one dose; None without repeated prints.
+    """Return half the variance between prints of one layout at one dose; None without repeated prints.
 
     The mean absolute value is that of the difference divided by √2. This is exact for a Gaussian, and within
     a few percent for other noise (``estimated_floor``).

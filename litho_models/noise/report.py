@@ -1,4 +1,4 @@
-"""``report.html`` of a noise analysis."""
+"""Write ``report.html`` of a noise analysis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
-# What each policy fits to a scan first, in words.
+# What each policy fits to a scan before the noise is measured, in words.
 _FREE = {
     "none": "nothing fitted",
     "offset": "the zero of each scan free",
@@ -31,7 +31,7 @@ _FREE = {
 
 
 def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], out: str | Path) -> Path:
-    """Render the result into ``out``; returns the page."""
+    """Render the result into ``out``; return the page."""
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
@@ -55,7 +55,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
 
 
 def noise_verdict(floor: NoiseFloor) -> str:
-    """How much of a model's error is noise, in one sentence."""
+    """Say in one sentence how much of a model's error is noise."""
     return filled(Path(__file__).with_name("verdict.jinja"), floor=floor).strip()
 
 
@@ -202,7 +202,7 @@ def _shape(freedom: float | None) -> str:
 def _covered(
     one: Calibration, rows: Sequence[Calibration | ScanCalibration], without: Collection[str] = ()
 ) -> Iterator[dict[str, object]]:
-    """Rows of a calibration, or of its scans, with a column for each level of its coverage."""
+    """Yield the rows of a calibration, or of its scans, with a column for each level of coverage."""
     for row in rows:
         shares = zip(one.levels, row.coverage, strict=True)
         known = row.model_dump(exclude={"name", "coverage", *without})

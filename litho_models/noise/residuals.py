@@ -1,4 +1,6 @@
-"""Residuals of a model on the scans of a store, from a benchmark's cache (out of fold) or a frozen model."""
+"""Read a model's residuals on the scans of a store, from a benchmark's cache (out of fold) or a frozen
+model.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +21,7 @@ from litho_models.scoring.records import Prediction
 
 
 class Residuals(NamedTuple):
-    """Residuals of a model on each scan: measured minus predicted, nm, NaN where not scored.
+    """The residuals of a model on each scan: measured minus predicted, nm; NaN where not scored.
 
     Attributes:
         maps_um: the map that the model expects of each scan, (ny, nx).
@@ -36,10 +38,11 @@ class Residuals(NamedTuple):
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Residuals of each scan, measured minus predicted, without its own terms (fitted on other pixels).
+    """Return residuals of each scan, measured minus predicted, without its own terms (fitted on other
+    pixels).
 
     The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
-    shared background, so that these are the residuals whose mean absolute value is the error stated there.
+    shared background. The mean absolute value of these residuals is therefore the error stated there.
 
     Args:
         store: the store that the source was made from.

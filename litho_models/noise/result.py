@@ -1,4 +1,6 @@
-"""``noise.json``: everything known about the noise of a dataset, and the floor that follows."""
+"""The record ``noise.json``: everything known about the noise of a dataset, and the floor that follows from
+it.
+"""
 
 from typing import ClassVar
 
@@ -38,7 +40,9 @@ class NoiseAnalysis(Result):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """The floor: from repeats, else from a flat print, else from the residuals of a model."""
+    """Choose the floor: from repeated prints, otherwise from a flat print, otherwise from the residuals of a
+    model.
+    """
     if repeats is not None:
         return NoiseFloor(
             mae_nm=repeats.mae_nm,

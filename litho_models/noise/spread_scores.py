@@ -1,7 +1,8 @@
-"""Scores of a stated spread: closed forms for a Gaussian or Student's t, and two that need no distribution.
+"""Score a stated spread by closed forms for a Gaussian or Student's t, and by two scores that need no
+distribution.
 
-CRPS of a Gaussian after Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with its sign
-turned.
+The CRPS of a Gaussian follows Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with the
+opposite sign.
 """
 
 from dataclasses import dataclass
@@ -18,45 +19,49 @@ _BINS = 10
 
 @dataclass(frozen=True)
 class Tails:
-    """Shape of a residual over its scale: Student's t, a Gaussian for ``freedom`` = ∞."""
+    """The shape of a residual over its scale: Student's t, or a Gaussian for ``freedom`` = ∞."""
 
     freedom: float = float("inf")
 
     def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
-        """Log density per pixel; its zero depends on the common unit of residual and scale."""
+        """Return the log density per pixel; its zero depends on the common unit of residual and scale."""
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: Array) -> Array | float:
-        """−2 d log density / d z²: how much a squared residual counts, 1 for a Gaussian."""
+        """Return −2 d log density / d z²: how much a squared residual counts, which is 1 for a Gaussian."""
         return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
 
     @property
     def information(self) -> float:
-        """Fisher information of a pixel about the logarithm of the squared scale."""
+        """Return the Fisher information of a pixel about the logarithm of the squared scale."""
         return 0.5 if np.isinf(self.freedom) else 0.5 * self.freedom / (self.freedom + 3)
 
     @property
     def sd(self) -> float:
-        """Standard deviation over the scale; it takes more than two degrees of freedom."""
+        """Return the standard deviation over the scale; this requires more than two degrees of freedom."""
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Probability below z; uniform for residuals over their scale if scale and shape are right (PIT)."""
+        """Return the probability below z, which is uniform for residuals over their scale if scale and shape
+        are right (PIT).
+        """
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Half width of the central interval that holds ``level``, over the scale."""
+        """Return the half width, over the scale, of the central interval that contains ``level``."""
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
-        """Whether each pixel lies within the central interval that should hold ``level`` of them."""
+        """Return whether each pixel lies within the central interval that should contain a share ``level`` of
+        them.
+        """
         return np.abs(residual) <= self.half_width(level) * scale
 
     def crps(self, residual: Array, scale: Array | float) -> Array:
-        """Continuous ranked probability score in the unit of the residual.
+        """Return the continuous ranked probability score in the unit of the residual.
 
-        It is the mean absolute error of a prediction that states its own spread; for scale → 0 it is |r|. Of
-        Student's t after Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        The score is the mean absolute error of a prediction that states its own spread; for scale → 0 it is
+        |r|. For Student's t it follows Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom
         density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
@@ -70,10 +75,11 @@ GAUSSIAN = Tails()
 
 
 def normalised_calibration_error(residual: Array, sigma: Array) -> float:
-    """ENCE: mean over bins of σ of ``|rms σ − rms r| / rms σ``.
+    """Return ENCE, the mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
-    Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins hold equal counts; pixels of one σ stay
-    in one bin, so that a constant σ has one. Chance leaves about ``1/√(π n)`` for n independent pixels a bin.
+    Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels of one σ
+    stay in one bin, so that a constant σ has one bin. By chance the result is about ``1/√(π n)`` for n
+    independent pixels a bin.
 
     Args:
         residual, sigma: (pixels,), one unit.
@@ -87,11 +93,12 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
-    """AUSE: excess of the mean ``|r|`` over the best possible while the pixels of largest σ are removed.
+    """Return AUSE, the excess of the mean ``|r|`` over the best possible while the pixels of largest σ are
+    removed.
 
-    Area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of all pixels;
-    0 where σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels of one σ count with
-    their mean, so that their order does not matter.
+    It is the area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of all
+    pixels; 0 if σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels with the same
+    σ count with their mean, so that their order does not matter.
 
     Args:
         residual, sigma: (pixels,), one unit; not all residuals zero.

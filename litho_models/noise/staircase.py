@@ -1,4 +1,4 @@
-"""Step prints: treads, heights of steps, and readability of neighbouring levels."""
+"""Evaluate step prints: treads, heights of steps, and readability of neighbouring levels."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
 from litho_models.scoring.statistics import rms
 
-# Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
+# Two heights can be told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
@@ -94,7 +94,7 @@ def step_print(
                 height_nm=step.height_nm,
                 uncertainty_nm=step.uncertainty_nm,
                 sigma_nm=sigma,
-                # float32 heights of 1 µm carry 6e-5 nm.
+                # float32 heights of 1 µm have an error of 6e-5 nm.
                 readability=abs(step.height_nm) / max(sigma, 1e-4),
                 misread=_misread(first, second),
             )
@@ -113,10 +113,10 @@ def step_print(
 
 
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
-    """The axis of a staircase and the pixels at which a new tread starts, ascending.
+    """Find the axis of a staircase and the pixels at which a new tread starts, ascending.
 
-    The profile of medians is fitted by constant pieces with the least squared error plus a price per edge.
-    The price is the saving by an edge between two of the narrowest treads that differ by half a level.
+    Constant pieces are fitted to the profile of medians with the least squared error plus a price per edge.
+    The price is the saving by an edge between two treads of the narrowest width that differ by half a level.
 
     Raises:
         InputError: no edge along either axis.
@@ -126,7 +126,7 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
         profile = np.nanmedian(height_um, axis=0 if axis == "x" else 1)
         profile = profile[np.isfinite(profile)]
         narrowest = max(3, int(len(profile) * _NARROWEST_TREAD))
-        # Two pieces of w pixels that differ by d: joining them costs w d²/2.
+        # If two pieces of w pixels that differ by d are joined, the error grows by w d²/2.
         price = narrowest * (level_height_um / 2) ** 2 / 2
         edges = _piecewise_constant(profile, price, narrowest)
         means = [piece.mean() for piece in np.split(profile, edges)]
@@ -142,7 +142,7 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
 
 def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[int]:
-    """Least squared error plus ``price`` per edge, by dynamic programming over the last edge."""
+    """Minimise the squared error plus ``price`` per edge, by dynamic programming over the last edge."""
     size = len(profile)
     sums = np.concatenate([[0.0], np.cumsum(profile)])
     squares = np.concatenate([[0.0], np.cumsum(profile**2)])
@@ -165,7 +165,9 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Columns of each tread without a guard at its edges, which is at most a third of its width."""
+    """Return the columns of each tread without a guard at its edges, which is at most a third of its
+    width.
+    """
     limits = [0, *edges_px, shape[1]]
     treads = []
     for start, stop in pairwise(limits):
@@ -175,7 +177,7 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
-    """Heights without the common tilt of all treads; NaN outside the treads."""
+    """Remove the common tilt of all treads from the heights; NaN outside the treads."""
     ny, nx = height_um.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     terms = [np.zeros((ny, nx)) for _ in treads]

@@ -1,4 +1,4 @@
-"""Roughness of one surface: bare substrate, flat print, or the treads of a staircase."""
+"""Measure the roughness of one surface: bare substrate, flat print, or the treads of a staircase."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -38,7 +38,7 @@ class SurfaceNoise(Record):
 
 
 class PrintNoise(Record):
-    """Roughness of the print alone: ``print² = flat² − substrate²``, nm.
+    """The roughness of the print alone: ``print² = flat² − substrate²``, nm.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
@@ -51,7 +51,7 @@ class PrintNoise(Record):
 
 
 def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -> SurfaceNoise:
-    """Roughness of one surface about its background.
+    """Measure the roughness of one surface about its background.
 
     Args:
         scan_id: name in the result.
@@ -82,7 +82,7 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
 
 
 def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
-    """Height minus its least-squares background over the measured pixels, float64 (ny, nx) µm."""
+    """Subtract the least-squares background over the measured pixels from the height, float64 (ny, nx) µm."""
     height = np.asarray(height_um, np.float64)
     finite = np.isfinite(height)
     if background == "offset":
@@ -94,7 +94,7 @@ def without_background(height_um: np.ndarray, background: Background) -> np.ndar
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
-    """The print alone, by quadrature: microscope and substrates are taken to add independently.
+    """Compute the print alone by quadrature, assuming that microscope and substrates add independently.
 
     Args:
         flat: of the flat print; ``substrates``: one or more, freed of the same background.

@@ -1,4 +1,4 @@
-"""Texture of flat surfaces: whether it has lines, in which direction, and with which period.
+"""Describe the texture of flat surfaces: whether it has lines, in which direction, and with which period.
 
 The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
 """
@@ -69,7 +69,7 @@ class Texture(Record):
 
     @property
     def verdict(self) -> str:
-        """In words: directed or not, periodic or not, at a chance of 1 in 1,000."""
+        """Say in words whether the texture is directed and periodic, at a chance of 1 in 1,000."""
         directed = (
             f"line-shaped, along {self.angle_deg:.0f}° from x" if self.isotropic_p < RARE else "no direction"
         )
@@ -83,7 +83,7 @@ class Texture(Record):
 
 
 def texture(name: str, heights_um: Sequence[np.ndarray], pitch_um: float) -> Texture:
-    """Texture of levelled surfaces, (ny, nx) µm each on square pixels; NaN is left out.
+    """Measure the texture of levelled surfaces, (ny, nx) µm each on square pixels; NaN is left out.
 
     Raises:
         InputError: a surface of fewer than 64 rows or columns.
@@ -117,6 +117,6 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Mean of each line; lines without a measured pixel get the mean of all."""
+    """Return the mean of each line; lines without a measured pixel get the mean of all lines."""
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

@@ -1,8 +1,8 @@
-"""σ(x): a log-linear model of a residual's spread by layout and position.
+"""Fit σ(x), a log-linear model of a residual's spread by layout and position.
 
-The mean is fitted first and kept. Then ln s² = X β is fitted to its out-of-fold residuals by maximum
-likelihood, with the tails of Student's t. In two stages the spread cannot excuse errors of the mean. Tens of
-scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
+The mean is fitted first and then kept. Then ln s² = X β is fitted to its out-of-fold residuals by maximum
+likelihood, with the tails of Student's t. With two stages the spread cannot excuse errors of the mean. Tens
+of scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Maps that σ may depend on; the slope is also taken squared, the radius also to the fourth power.
+# Maps on which σ may depend; the slope is also taken squared, and the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
-# Linear between the knots: rare levels at both ends are twice as rough as the middle.
+# The dependence is linear between the knots: rare levels at both ends are twice as rough as the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
 COVARIATES = (
     *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
@@ -26,7 +26,7 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# Shapes from much heavier tails than those of prints to a Gaussian.
+# Shapes from tails much heavier than those of prints to a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
 # The optical spot, which blurs edges of the layout.
 _SLOPE_BLUR_UM = 0.2
@@ -37,11 +37,12 @@ _STEPS = 60
 
 
 class VarianceModel(Record):
-    """ln s² = Σ β_j φ_j, s in nm; ``coefficients`` in the order of ``covariates``.
+    """The model ln s² = Σ β_j φ_j, s in nm, with ``coefficients`` in the order of ``covariates``.
 
-    Level on 0 ... 1 of the range, linear between knots; slope of the blurred layout (height over
-    length); distance to the next change of level, at most 2 µm, in units of that; radius from the field's
-    centre in units of half its diagonal. ``freedom``: of Student's t with scale s; None for a Gaussian.
+    The covariates are the level on 0 ... 1 of the range, linear between knots; the slope of the blurred
+    layout (height over length); the distance to the next change of level, at most 2 µm, in units of this
+    maximum; and the radius from the field's centre in units of half its diagonal. ``freedom`` belongs to
+    Student's t with scale s; None for a Gaussian.
     """
 
     covariates: list[str]
@@ -50,7 +51,7 @@ class VarianceModel(Record):
 
 
 def place_maps(scan: PrintedScan) -> dict[str, Array]:
-    """``PLACES`` of each pixel of a scan, (ny, nx) each."""
+    """Return the maps ``PLACES`` for each pixel of a scan, (ny, nx) each."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
@@ -68,19 +69,19 @@ def place_maps(scan: PrintedScan) -> dict[str, Array]:
 
 
 def covariates_of(places: dict[str, Array]) -> Array:
-    """φ of each pixel, (..., covariates), from ``place_maps`` or a choice of their pixels."""
+    """Return φ of each pixel, (..., covariates), from ``place_maps`` or a selection of its pixels."""
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
     return np.stack([*between, slope, slope**2, edge, radius2, radius2**2], axis=-1)
 
 
 def layout_slope(scan: PrintedScan) -> Array:
-    """Slope of the layout behind the optical spot, height over length, (ny, nx)."""
+    """Return the slope of the layout behind the optical spot, height over length, (ny, nx)."""
     return np.hypot(*np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM), scan.pitch_um))
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
-    """Scale and tails that make the residuals most likely: β of ln s² = X β, and the shape."""
+    """Find the scale and tails that make the residuals most likely: β of ln s² = X β, and the shape."""
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
         beta = fit_log_scale(covariates, residual, tails)
@@ -91,9 +92,9 @@ def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
 
 
 def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -> Array:
-    """β of ln s² = X β by maximum likelihood, Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
+    """Fit β of ln s² = X β by maximum likelihood with Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
 
-    The information I of a pixel about ln s² does not depend on s; so one matrix serves all steps.
+    The information I of a pixel about ln s² does not depend on s, so one matrix serves all steps.
 
     Args:
         covariates: X, (pixels, k), some sum of columns constant.
@@ -126,11 +127,11 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
 
 
 def scale_nm(beta: Array, covariates: Array) -> Array:
-    """s of each pixel, nm; ``covariates`` (..., k)."""
+    """Return s of each pixel, nm; ``covariates`` has shape (..., k)."""
     return np.exp(0.5 * covariates @ beta)
 
 
 def variance_model(beta: Array, tails: Tails) -> VarianceModel:
-    """The fitted coefficients as a record."""
+    """Return the fitted coefficients as a record."""
     freedom = None if np.isinf(tails.freedom) else tails.freedom
     return VarianceModel(covariates=list(COVARIATES), coefficients=beta.tolist(), freedom=freedom)

@@ -1,1 +1,1 @@
-"""Errors and metrics: of one scan, over scans, between models."""
+"""Compute errors and metrics of one scan, over scans, and between models."""

@@ -1,7 +1,7 @@
 """Compare films by area and by missing, extra or merged features.
 
-A feature is a connected part of the film or of the ground within it, of at least four pixels, cut at half the
-film's height.
+A feature is a connected part of the film, or of the ground within the film, of at least four pixels; films
+are cut at half their height.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,9 @@ FILMS_TEXT = (
 
 
 class FilmErrors(NamedTuple):
-    """``area_error_percent`` of the measured area, None without any; the rest are counts of features."""
+    """``area_error_percent`` is relative to the measured area, or None without any; the other fields are
+    counts of features.
+    """
 
     area_error_percent: float | None
     missing: int
@@ -30,12 +32,12 @@ class FilmErrors(NamedTuple):
 
 
 def films_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> FilmErrors:
-    """Compare the film of a scan with the predicted one, the per-scan terms removed."""
+    """Compare the film of a scan with the predicted film after the per-scan terms are removed."""
     return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
 
 
 def film_edge_um(scan: PrintedScan) -> float:
-    """Half the height of the film, µm."""
+    """Return half the height of the film, µm."""
     return (scan.levels - 1) * scan.level_height_um / 2
 
 
@@ -60,7 +62,7 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """For each large enough part of either film, the number of parts of the other film that it touches."""
+    """Count for each large enough part of either film the parts of the other film that it touches."""
     from scipy.ndimage import label
 
     labels = [label(one)[0] for one in (first, second)]

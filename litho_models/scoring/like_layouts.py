@@ -1,8 +1,8 @@
-"""The gamma test: the difference of residuals at pixels with similar surroundings.
+"""The gamma test: compare residuals at pixels with similar surroundings.
 
-A model of the layout can still learn residuals that are the same in similar surroundings; differences there
-are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of
-other scans, so datum, gain and bow of single scans count as noise.
+A model of the layout can still learn residuals that are the same in similar surroundings; differences between
+them are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels
+of other scans, so datum, gain and bow of single scans count as noise.
 """
 
 from collections.abc import Sequence
@@ -33,10 +33,10 @@ class LikePixels(NamedTuple):
     partners: Array
 
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
-        """Each pixel's estimate of the variance of its noise, and its squared residual, (n,) each.
+        """Return each pixel's estimate of the variance of its noise, and its squared residual, (n,) each.
 
         Each residual r₀, r₁ ... r_m is noise plus a misfit that similar surroundings share. The mean of (r₀ −
-        r_j)(r₀ − r_k), j ≠ k, is then the variance of the noise in r₀ alone, whatever the noise of the
+        r_j)(r₀ − r_k), j ≠ k, is therefore the variance of the noise in r₀ alone, whatever the noise of the
         partners. Half a squared difference would be too small for rare surroundings, which are rougher than
         their partners.
 
@@ -55,7 +55,7 @@ class LikePixels(NamedTuple):
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
     """Draw pixels, and find for each the pixels of other scans with the most similar surroundings.
 
-    Only prints of one dose are compared, because doses change the height even for equal layouts.
+    Only prints of one dose are compared, because the dose changes the height even for equal layouts.
 
     Args:
         scans: at least three of one dose, with layouts that vary; otherwise the result is None.
@@ -96,7 +96,7 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Features of each pixel's surroundings: blurred layouts and two slopes, (k, ny·nx), µm."""
+    """Return features of each pixel's surroundings: blurred layouts and two slopes, (k, ny·nx), µm."""
     maps = [blurred_layout_um(scan, sigma_um) for sigma_um in _BLURS_UM]
     slopes = np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM))
     maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
@@ -104,14 +104,14 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
-    """The layout of a scan, blurred by a Gaussian, (ny, nx) float64; its outermost pixels are continued."""
+    """Blur the layout of a scan by a Gaussian, (ny, nx) float64; its outermost pixels are continued."""
     from scipy.ndimage import gaussian_filter
 
     return gaussian_filter(scan.layout_um.astype(np.float64), sigma_um / scan.pitch_um, mode="nearest")
 
 
 def _whitened(feature: Array) -> Array:
-    """Scale features to unit covariance, so distances do not depend on their scale."""
+    """Return the scale features to unit covariance, so distances do not depend on their scale."""
     centred = feature - feature.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov(centred.T))
     kept = values > 1e-9 * values.max()

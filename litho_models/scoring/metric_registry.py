@@ -1,7 +1,7 @@
-"""Further metrics of a scan, each with name, unit and meaning; every report shows them.
+"""Further metrics of a scan, each with a name, a unit and a meaning; every report shows them.
 
-A metric gets one scan, the model's prediction, and the residual without the scan's nuisances. Built-in
-metrics are fields of the results; registered ones are listed under ``metrics``.
+A metric function receives one scan, the model's prediction, and the residual without the per-scan terms.
+Built-in metrics are fields of the results; registered ones are listed under ``metrics``.
 """
 
 import math
@@ -30,14 +30,14 @@ class Metric(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name in results and tables: with the unit, unless it has none (``1``)."""
+        """Return the name in results and tables: with the unit, unless the unit is ``1``."""
         return self.name if self.unit == "1" else f"{self.name}_{self.unit}"
 
 
 class Measurement(NamedTuple):
-    """Metrics that one function returns, in this order, with a sentence that explains them.
+    """The metrics that one function returns, in this order, with a sentence that explains them.
 
-    ``instrument``: kind of instrument whose scans have them; empty: all kinds.
+    ``instrument`` is the kind of instrument whose scans have these metrics; empty stands for all kinds.
     """
 
     metrics: tuple[Metric, ...]
@@ -76,9 +76,9 @@ def register_metric(
 ) -> Metric:
     """Add a metric to every evaluation and benchmark made from now on in this process.
 
-    ``function(scan, prediction_um, residual_um)`` gets the ``PrintedScan``, the predicted map and the
-    measured minus predicted map freed of its nuisances, (ny, nx) in µm, NaN where not scored. It returns a
-    number, or None if there is nothing to measure. Example::
+    ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan``, the predicted map, and
+    measured minus predicted heights without the per-scan terms, (ny, nx) in µm, NaN where not scored. It
+    returns a number, or None if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
@@ -108,7 +108,7 @@ def register_metric(
 
 
 def registered_metrics() -> list[Metric]:
-    """All metrics, in the order of the tables."""
+    """Return all metrics, in the order of the tables."""
     return [metric for measurement in _MEASUREMENTS for metric in measurement.metrics]
 
 
@@ -118,7 +118,7 @@ def metrics_text() -> str:
 
 
 def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> dict[str, Any]:
-    """All metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
+    """Compute all metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
 
     Raises:
         InputError: a metric that returns no number.

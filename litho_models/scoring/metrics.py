@@ -1,4 +1,4 @@
-"""The errors of one scan, over its valid pixels."""
+"""Compute the errors of one scan over its valid pixels."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -13,14 +13,16 @@ from litho_models.scan_terms import POLICIES, Blocks, CrossFit, cross_fit
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
-# Step of the index from air to resist, at the red helium-neon line, for which the elements are made.
+# Step of the refractive index from air to resist, at the red helium-neon line, for which the elements are
+# made.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """Measured height = slope · prediction + intercept, and the standard error of the slope.
+    """The line measured height = slope · prediction + intercept, and the standard error of the slope.
 
-    None where they cannot be known: a constant prediction has no slope, a single block no error.
+    Values are None if they cannot be known: a constant prediction has no slope, and a single block has no
+    error.
     """
 
     slope: float | None
@@ -31,11 +33,11 @@ class PrintGain(NamedTuple):
 def print_gain(
     height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
-    """Least-squares line through the used pixels of a scan.
+    """Fit a least-squares line to the used pixels of a scan.
 
-    Neighbouring pixels share their residual, so the variance is that of whole blocks (Liang and Zeger
-    1986): the sums of residual times regressor over a block are taken as independent from block to
-    block, which holds where blocks are wide against the correlation length (7 px on the measured prints).
+    Neighbouring pixels share their residual, so the variance is that of whole blocks (Liang and Zeger 1986).
+    The sums of residual times regressor over a block are taken as independent between blocks, which holds if
+    blocks are wide compared with the correlation length (7 px on the measured prints).
 
     Args:
         height_um, prediction_um: (ny, nx), float; ``used``: (ny, nx) bool, one pixel at least.
@@ -83,7 +85,7 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
+    """Return the mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
     fits = (
         cross_fit(scan.height_um, height, scan.valid, POLICIES["offset"])
         for scan, height in zip(scans, heights_um, strict=True)
@@ -92,5 +94,7 @@ def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> 
 
 
 def phase_waves(height_error_um: float) -> float:
-    """Phase error, in waves, of light that passes an element whose height is wrong by ``height_error_um``."""
+    """Return the phase error, in waves, of light that passes an element whose height is wrong by
+    ``height_error_um``.
+    """
     return height_error_um * INDEX_STEP / WAVELENGTH_UM

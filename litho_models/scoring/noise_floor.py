@@ -26,8 +26,8 @@ NOISE_FILE = "noise.json"
 class PolicyFloor(Record):
     """The floor of the errors under one nuisance policy, nm, with 95 % intervals over prints.
 
-    ``k``: terms per scan, the effective number where lines have offsets. No interval with fewer than six
-    prints.
+    ``k`` is the number of terms per scan, or the effective number if lines have offsets. There is no interval
+    with fewer than six prints.
     """
 
     policy: Policy
@@ -39,11 +39,11 @@ class PolicyFloor(Record):
 
 
 class NoiseFloor(Record):
-    """The error by noise alone; ``kind`` states how it was estimated.
+    """The error that noise alone causes; ``kind`` states how it was estimated.
 
-    ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``; ``by_policy`` has a floor for each policy and
-    is empty where only that one is known, and in older result files. Kinds ``lower-bound`` and ``literature``
-    are found in older files, and the first in loops on fewer than three scans.
+    ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``. ``by_policy`` has a floor for each policy; it
+    is empty if only that one is known, and in older result files. The kinds ``lower-bound`` and
+    ``literature`` occur in older files, and the first also in loops on fewer than three scans.
     """
 
     mae_nm: float | None
@@ -53,11 +53,11 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """The floor of the errors under this policy; None if unknown."""
+        """Return the floor of the errors under this policy; None if unknown."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
-        """Its mean absolute error, nm."""
+        """Return the mean absolute error of the floor under this policy, nm."""
         row = self.at(policy)
         return row.mae_nm if row else self.mae_nm if policy == "offset" else None
 
@@ -83,7 +83,7 @@ class _StatedFloor(Result):
 
 
 def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
-    """The floor from a noise analysis; unknown without one.
+    """Read the floor from a noise analysis; without an analysis the floor is unknown.
 
     Args:
         dataset_name: name of the dataset whose errors are reported.
@@ -124,7 +124,9 @@ def freed_by_policy(
     blocks: Blocks | None = None,
     policies: Iterable[Policy] = tuple(POLICIES),
 ) -> dict[Policy, list[CrossFit]]:
-    """Residuals of each scan under each policy; ``maps_um``: expected maps (ny, nx), µm."""
+    """Return the residuals of each scan under each policy; ``maps_um`` contains the expected maps (ny, nx),
+    µm.
+    """
     return {
         policy: [
             cross_fit(scan.height_um, expected, scan.usable, POLICIES[policy], blocks)
@@ -144,7 +146,7 @@ def floor_of_residuals(
 
     On drawn pixels ``LikePixels`` finds the part of the squared error that similar surroundings do not share.
     The floor is the error over all scored pixels times the root of this part. For the mean absolute error
-    this assumes that noise and residual have the same shape, E|n|/σ; noise makes up nearly all of the
+    this assumes that noise and residual have the same shape, E|n|/σ. Noise makes up nearly all of the
     residual, so no Gaussian is assumed. If a misfit of another shape had half of the squares (Laplace in
     Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
 
@@ -154,7 +156,7 @@ def floor_of_residuals(
         freed: from ``freed_by_policy``, including ``offset``.
         seed: decides which pixels are drawn.
     """
-    # In the order of their ids, so the same scans always give the same pixels.
+    # Scans are taken in the order of their ids, so that the same scans always give the same pixels.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
     scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]

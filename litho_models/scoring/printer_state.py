@@ -1,4 +1,4 @@
-"""Figures of one scan for the state of the printer: gain, error, and the kind of layout."""
+"""Describe the state of the printer by figures of one scan: gain, error, and the kind of layout."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,13 +17,13 @@ _SURFACE = frozenset({"offset", "bow"})
 
 
 class ScanFigures(Record):
-    """Figures of one scan against a model, both free of the scan's offset, tilt and bow.
+    """Figures of one scan against a model, without the scan's offset, tilt and bow.
 
-    ``gain``: measured over predicted height, with its standard error (of blocks, see ``print_gain``; None for
-    a single block). ``error_nm``: mean absolute error with the gain free too (policy ``full``, k = 7), terms
-    fitted on other pixels. ``order``: of printing. ``relief_nm`` and ``steepness``: standard deviation and
-    rms slope of the predicted height, which characterise the layout. ``held_out``: whether the model was not
-    trained on the scan.
+    ``gain`` is measured over predicted height, with its standard error (of blocks, see ``print_gain``; None
+    for a single block). ``error_nm`` is the mean absolute error with the gain free too (policy ``full``, k =
+    7), and terms fitted on other pixels. ``order`` is the position in printing. ``relief_nm`` and
+    ``steepness`` are the standard deviation and rms slope of the predicted height, which characterise the
+    layout. ``held_out`` says that the model was not trained on the scan.
     """
 
     scan: str
@@ -42,7 +42,7 @@ class ScanFigures(Record):
 def scan_figures(
     scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
 ) -> ScanFigures | None:
-    """Figures of a scan; None for a flat layout, which has no gain.
+    """Return the figures of a scan; None for a flat layout, which has no gain.
 
     Offset, tilt and bow are removed from both height and prediction, which gives the same gain as a joint fit
     of all terms (Frisch and Waugh 1933).
@@ -83,7 +83,7 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Figures of a model's training scans, for its card; none if fields are too small."""
+    """Return the figures of a model's training scans, for its card; none if fields are too small."""
     pairs = zip(scans, predictions_um, strict=True)
     try:
         rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]

@@ -1,4 +1,6 @@
-"""Records of scoring: a prediction, the scores of a scan and of a model, and two models' paired scores."""
+"""Records of scoring: a prediction, the scores of a scan and of a model, and the paired scores of two
+models.
+"""
 
 from __future__ import annotations
 
@@ -21,29 +23,29 @@ from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
 LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
-"""The error by which models are ranked and compared, by the instrument."""
+"""The error by which models are ranked and compared, for each instrument."""
 
 
 class Prediction(NamedTuple):
-    """The expected scan of a model, (ny, nx) µm: the print, and the part that scans share, if known."""
+    """What a model expects of a scan, (ny, nx) µm: the print, and the part that scans share, if known."""
 
     height_um: Array
     background_um: Array | None = None
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """A print with a learned background on its field, if there is one."""
+        """Add a learned background to a print on its field, if there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
-        """A print with a learned measurement model on the scan's field."""
+        """Apply a learned measurement model to a print on the scan's field."""
         return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
     def map_um(self) -> Array:
-        """The expected map of the microscope."""
+        """Return the map that the microscope is expected to show."""
         return self.height_um if self.background_um is None else self.height_um + self.background_um
 
 
@@ -57,10 +59,10 @@ class PolicyError(Record):
 
 
 class MetricValues(Record):
-    """Metrics besides the errors, of maps freed of their nuisances (``metric_registry``).
+    """Metrics in addition to the errors, computed on maps without the per-scan terms (``metric_registry``).
 
-    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``, others by name and unit under
-    ``metrics``. None where there was nothing to compare, or in older result files.
+    SSIM is as in ``structural_similarity`` and edges are as in ``EdgePlacement``; others are listed by name
+    and unit under ``metrics``. A metric is None if there was nothing to compare, and in older result files.
     """
 
     ssim: float | None = None
@@ -72,19 +74,19 @@ class MetricValues(Record):
     metrics: dict[str, float | None] = Field(default_factory=dict)
 
     def metric(self, key: str) -> float | None:
-        """The metric of that name in results; None where it was not measured."""
+        """Return the metric of that name in results; None if it was not measured."""
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
 class ScanErrors(Record):
-    """Error of one model on one scan over the scored pixels.
+    """The error of one model on one scan over the scored pixels.
 
-    ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free`` terms
+    ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free``, terms
     fitted on other pixels are removed. Slope and intercept are the gain and offset of the print against the
     prediction (``print_gain``).
     """
 
-    # Older results also have the error of the intercept.
+    # Older results also contain the error of the intercept.
     model_config = ConfigDict(extra="ignore")
 
     pixels: int
@@ -110,11 +112,11 @@ class ModelScores(MetricValues):
     """All scores of one model: means over scans, sums of counts, and intervals from resampled scans.
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
-    have no smooth terms themselves; it is empty where the protocol has no background. ``phase_rms_waves`` is
-    the RMS phase error of light that passes the print.
+    have no smooth terms themselves. It is empty if the protocol has no background. ``phase_rms_waves`` is the
+    RMS phase error of light that passes the print.
     """
 
-    # Older results also have the spread of line offsets.
+    # Older results also contain the spread of line offsets.
     model_config = ConfigDict(extra="ignore")
 
     model: str
@@ -138,26 +140,30 @@ class ModelScores(MetricValues):
 
     @property
     def leading_nm(self) -> float:
-        """The error that ranks models: edges for films, heights otherwise; infinite without an edge."""
+        """Return the error that ranks models: of edges for films, of heights otherwise; infinite without an
+        edge.
+        """
         value = getattr(self, LEADING[self.seen_by])
         return math.inf if value is None else float(value)
 
     @property
     def leading_ci95_nm(self) -> Interval:
-        """Its interval."""
+        """Return the interval of the leading error."""
         return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """The leading error of every scan by id; NaN without an edge."""
+        """Return the leading error of every scan by id; NaN without an edge."""
         values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
         return {scan: math.nan if value is None else value for scan, value in values.items()}
 
 
 class Paired(Record):
-    """Mean over scans of first minus second leading error; negative means the first is better.
+    """The mean over scans of the first model's leading error minus the second's; a negative mean favours the
+    first model.
 
-    ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
+    ``over_prints`` is the same with whole prints resampled; None for a single print, or in older result
+    files.
     """
 
     first: str
@@ -171,7 +177,7 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of the same scans, paired by id because results list them by fold.
+    """Compare the leading errors of the same scans, paired by id, because results list scans by fold.
 
     Raises:
         InputError: scores of different scans.

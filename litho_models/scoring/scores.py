@@ -1,4 +1,4 @@
-"""Score a model: from predictions of scans to one validated record."""
+"""Score a model: turn predictions of scans into one validated record."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms, the only ones whose errors depend on a smooth background.
+# Policies without smooth terms; only their errors depend on a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 
@@ -25,7 +25,7 @@ def score_model(
     predictions: Sequence[Prediction],
     protocol: NuisanceProtocol,
 ) -> ModelScores:
-    """Score the predictions of one model on whole scans under one protocol and, beside it, all policies.
+    """Score the predictions of one model on whole scans, under one protocol and also under all policies.
 
     Args:
         name: name of the model.

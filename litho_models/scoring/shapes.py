@@ -1,8 +1,8 @@
-"""The shape of a printed map: structural similarity, and edge placement.
+"""Compare the shapes of printed maps: structural similarity and edge placement.
 
-Edges are contours of both maps at the heights halfway between nominal levels. Marching squares interpolate
-their positions linearly between pixels. Nothing is smoothed, so the roughness of the measured contour is part
-of the error.
+Edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds their
+positions by linear interpolation between pixels. Nothing is smoothed, so the roughness of the measured
+contour is part of the error.
 """
 
 from typing import NamedTuple
@@ -37,10 +37,12 @@ EDGES_TEXT = (
 
 
 class EdgePlacement(NamedTuple):
-    """Distances of the measured contours' pieces (at most a pixel long) from the expected contour.
+    """The distances of the pieces of the measured contours (each at most a pixel long) from the expected
+    contour.
 
     A piece has a partner if the expected contour of the same height passes within the search distance and
-    rises to the same side. ``mean_nm`` and ``p95_nm`` cover pieces with a partner; None if there are none.
+    rises to the same side. ``mean_nm`` and ``p95_nm`` cover pieces with a partner; they are None if there are
+    none.
     """
 
     mean_nm: float | None
@@ -56,12 +58,14 @@ class _Contour(NamedTuple):
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
-    """SSIM of a scan and its prediction, the per-scan terms removed (prediction plus residual)."""
+    """Return the SSIM of a scan and its prediction after the per-scan terms are removed (prediction plus
+    residual).
+    """
     return structural_similarity(prediction_um + residual_um, prediction_um)
 
 
 def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> EdgePlacement:
-    """Compare the edges of a scan with the predicted ones, the per-scan terms removed."""
+    """Compare the edges of a scan with the predicted edges after the per-scan terms are removed."""
     heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
     if scan.seen_by == "sem":
         heights, search_um = np.array([film_edge_um(scan)]), FILM_SEARCH_PX * scan.pitch_um
@@ -69,10 +73,10 @@ def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -
 
 
 def structural_similarity(measured_um: Array, expected_um: Array) -> float | None:
-    """Mean SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861): 1 for equal maps.
+    """Return the mean SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861), which is 1 for equal maps.
 
-    Gaussian window of standard deviation ``SSIM_SIGMA_PX``, ``SSIM_WINDOW_PX`` wide; data range
-    ``SSIM_RANGE_UM`` for all maps. Only windows within the scored pixels count.
+    The Gaussian window has the standard deviation ``SSIM_SIGMA_PX`` and the width ``SSIM_WINDOW_PX``; the
+    data range is ``SSIM_RANGE_UM`` for all maps. Only windows within the scored pixels count.
 
     Args:
         measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape.
@@ -134,7 +138,7 @@ def edge_placement(
 
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> FloatMap:
-    """Heights half way between neighbouring nominal levels, (levels - 1,) µm."""
+    """Return the heights half way between neighbouring nominal levels, (levels - 1,) µm."""
     return np.arange(0.5, levels - 1, dtype=np.float64) * level_height_um
 
 
@@ -149,7 +153,9 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
 
 
 def _distance_px(of: _Contour, to: _Contour, search_px: float) -> FloatMap:
-    """Distance of the middle of each piece from the nearest piece that rises to the same side, else inf."""
+    """Return the distance of the middle of each piece from the nearest piece that rises to the same side;
+    otherwise inf.
+    """
     from scipy.spatial import KDTree
 
     middle = of.start + of.along / 2

@@ -1,5 +1,6 @@
-"""Statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are drawn and change
-sign; where scans of one print share its day and batch, whole prints."""
+"""Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are drawn
+and change sign. If scans of one print share its day and batch, whole prints are drawn instead.
+"""
 
 from collections.abc import Hashable, Sequence
 
@@ -10,12 +11,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
-# Fewest units for p below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
+# Fewest units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
 PERMUTATIONS = 1999
-# Ends of a 95 % interval, written so because 0.025 differs in its last bits.
+# The ends of a 95 % interval are written in this way because 0.025 differs in its last bits.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 # Up to this many scans every combination of signs is used. A screening tests all directions at once and stops
 # one scan earlier than a comparison of two models, which halves its table.
@@ -25,7 +26,7 @@ _ROUNDING = 1 - 1e-12
 
 
 def rms(values: ArrayLike) -> float:
-    """Root of the mean square."""
+    """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -36,9 +37,10 @@ def bootstrap_interval(
     draws: int = BOOTSTRAP_DRAWS,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Percentile interval of the mean over scans, resampling whole scans, or whole groups of them.
+    """Return the percentile interval of the mean over scans, by resampling whole scans, or whole groups of
+    scans.
 
-    A single scan or group cannot be resampled: both ends are NaN.
+    A single scan or group cannot be resampled, so both ends are NaN.
 
     Args:
         values: one per scan; ``groups``: the print of each scan, if prints are what is resampled.
@@ -50,9 +52,9 @@ def bootstrap_interval(
 
 
 def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> tuple[float, float] | None:
-    """Interval of a mean over pixels, resampling prints, of which each counts with its pixels.
+    """Return the interval of a mean over pixels, by resampling prints, each of which counts with its pixels.
 
-    None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
+    Return None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
 
     Args:
         values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
@@ -74,7 +76,7 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
 
 
 def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
-    """Sum and count of the values of each group; each value by itself without groups."""
+    """Return sum and count of the values of each group; without groups, each value by itself."""
     sample = np.asarray(values, np.float64)
     if groups is None:
         return sample, np.ones(sample.size)
@@ -83,12 +85,14 @@ def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Arr
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """As ``bootstrap_interval``, for results: None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
+    """Return what ``bootstrap_interval`` does, but None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
-    """Signs (draws, count), the observed ones first: all of them up to ``exact_scans``, 10,000 beyond."""
+    """Return signs (draws, count), the observed ones first: all combinations up to ``exact_scans``, 10,000
+    beyond.
+    """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
     drawn = np.random.default_rng(seed).choice([-1.0, 1.0], size=(SIGN_FLIP_DRAWS, count))
@@ -96,14 +100,15 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
 
 
 def one_sided_flip_p(values: Array) -> float:
-    """Share of sign flips of the scans' values whose sum reaches the observed one."""
+    """Return the share of sign flips of the scans' values whose sum reaches the observed sum."""
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
 
 def smallest_flip_p(count: int) -> float:
-    """Smallest two-sided sign-flip p of this many scans or prints: two of all combinations of signs.
+    """Return the smallest two-sided sign-flip p of this many scans or prints: two of all combinations of
+    signs.
 
-    Six prints cannot go below 2 / 2^6 = 0.031, however large the difference.
+    With six prints it is 2 / 2^6 = 0.031, however large the difference.
     """
     return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
 
@@ -111,9 +116,10 @@ def smallest_flip_p(count: int) -> float:
 class OverUnits(Record):
     """The mean of a difference over scans, with interval and p by resampling whole scans or prints.
 
-    ``count``: number of units; ``positive``: units with a positive difference. ``ci95_nm``: bootstrap
-    interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, all combinations up
-    to 14 units and 9,999 random ones beyond, the observed one counted in; not below ``smallest_p``.
+    ``count`` is the number of units, and ``positive`` the number of units with a positive difference.
+    ``ci95_nm`` is a bootstrap interval, None with fewer than ``FEWEST_FOR_INTERVAL`` units. ``p`` is from
+    two-sided sign flips: all combinations up to 14 units, and 9,999 random ones beyond, counting the observed
+    one. It is never below ``smallest_p``.
     """
 
     count: int
@@ -151,7 +157,7 @@ def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: in
 
 
 class ByPrint(Record):
-    """One-way analysis of variance of one estimate per scan, prints as groups.
+    """A one-way analysis of variance of one estimate per scan, with prints as groups.
 
     Args:
         f: mean square between prints over that within, on ``degrees`` of freedom (between, within).
@@ -193,6 +199,6 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     f = float(ratios[0])
     size = (len(members) - float((counts**2).sum()) / len(members)) / between
     icc = max((f - 1) / (f + size - 1), 0.0)
-    # Rounding must not put the observed order below itself.
+    # Rounding must not place the observed order below itself.
     p = float((ratios >= f * (1 - 1e-12)).mean())
     return ByPrint(f=f, degrees=(between, within), icc=icc, p=p)

@@ -1,4 +1,4 @@
-"""The dependence of an error on level and spatial frequency."""
+"""Measure how an error depends on level and spatial frequency."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """Error at the pixels printed with one level, nm; scans count where the level occurs."""
+    """The error at the pixels printed with one level, nm; a scan counts if the level occurs in it."""
 
     level: int
     pixels: int
@@ -28,7 +28,8 @@ class LevelError(Record):
 class TransferCurves(Record):
     """Prediction against measurement per frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
 
-    ``error_psd``: one-sided density of the error's power along lines, nm² per cycle/µm, line means removed.
+    ``error_psd`` is the one-sided power density of the error along lines, nm² per cycle/µm, with line means
+    removed.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -43,7 +44,7 @@ class TransferCurves(Record):
 
 
 def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
-    """Bias (measured minus predicted) and standard deviation per layout level, over scored pixels.
+    """Return bias (measured minus predicted) and standard deviation per layout level, over scored pixels.
 
     Args:
         scans: the scans; ``residuals_um``: measured minus predicted (ny, nx), NaN where not scored.
@@ -66,9 +67,10 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
-    """Transfer, coherence and error from line spectra (Hann window, line mean removed), over all lines.
+    """Compute transfer, coherence and error from line spectra (Hann window, line mean removed), over all
+    lines.
 
-    The frequency axis has ``TRANSFER_BANDS`` equal bands up to Nyquist of the layout pitch.
+    The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
     pitch = scans[0].pitch_um
     edges = np.linspace(0, 0.5 / pitch, TRANSFER_BANDS + 1)
@@ -90,9 +92,10 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Sums over lines and the frequencies of each band, (5, bands): cross, measured, predicted, error, count.
+    """Return sums over lines and the frequencies of each band, (5, bands): cross, measured, predicted, error,
+    count.
 
-    The error is a one-sided density (µm² per cycle/µm), the count that of its terms.
+    The error is a one-sided density (µm² per cycle/µm), and the count is the number of its terms.
     """
     window = np.hanning(height.shape[1])
     measured, predicted = (
