@@ -26,7 +26,7 @@ class RunFacts(Record):
     """Command line and code of a result.
 
     ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
-    commit. It is None without a checkout, and in older result files.
+    commit. ``dirty`` is None without a checkout, and in older result files.
     """
 
     command: str = ""
@@ -91,7 +91,7 @@ def checkout_state(folder: Path) -> dict[str, Any]:
     """Return the ``commit`` of a checkout, and whether it is ``dirty``: a file of the packages is changed or
     not in git.
 
-    Both are None without a checkout, as for an installed wheel.
+    Both values are None without a checkout, as for an installed wheel.
     """
     if not (folder / ".git").exists():
         return {"commit": None, "dirty": None}

@@ -27,8 +27,8 @@ def random_layout(
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the nearest of
     ``levels`` values. The result is periodic in both directions. The paper does not define the low-pass
     filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) and ±0.5
-    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated, not
-    rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
+    cycles/µm (prints 6 and 7). The measured layouts were cut from a larger field, and their levels were
+    truncated, not rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.

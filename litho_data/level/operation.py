@@ -64,8 +64,8 @@ def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Register a function of heights and usable pixels as the operation of that name.
 
     The function receives heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of
-    any type, a ``mask`` and ``masking``; see ``select``. Its keyword arguments become fields of the step,
-    which are checked at every call, except those that come with the scan. The function returns a
+    any type, a ``mask`` and ``masking``; see ``select``. The function's keyword arguments become fields of
+    the step, which are checked at every call, except those that come with the scan. The function returns a
     ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
     """
 

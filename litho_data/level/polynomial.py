@@ -66,7 +66,7 @@ def level_robust(
     """Subtract the robust polynomial with its constant, which places the main surface at zero.
 
     The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
-    weight to distant features. It starts from Huber's solution, which has a single minimum.
+    weight to distant features. The biweight starts from Huber's solution, which has a single minimum.
 
     Args:
         z: (ny, nx), any unit.

@@ -13,8 +13,8 @@ Masking = Literal["ignore", "exclude", "include"]
 class Levelled(NamedTuple):
     """A levelled map and the surface removed; ``height + removed`` is the input.
 
-    Both are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``. ``removed``
-    is a number everywhere, and may be a read-only view if it is constant along an axis.
+    Both maps are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``.
+    ``removed`` is a number everywhere, and may be a read-only view if it is constant along an axis.
     """
 
     height: Array

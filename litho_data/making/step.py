@@ -33,7 +33,8 @@ class Step:
 
     ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), and ``outputs``
     are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source code
-    that ran. It is recorded but is not part of the id, because moving a comment does not change a result.
+    that ran. This hash is recorded but is not part of the id, because moving a comment does not change a
+    result.
     """
 
     op: str

@@ -16,9 +16,9 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 # Misfits in units of their robust standard deviation. An area whose misfit reaches the first value is
-# suspected and traced down to the second. It is a defect if its misfit reaches the third after the warp is
-# fitted without it. Effects of a printer other than a Gaussian blur stay below the third value: 13.5 on the
-# measured prints.
+# suspected and traced down to the second. The area is a defect if its misfit reaches the third value after
+# the warp is fitted without the area. Effects of a printer other than a Gaussian blur stay below the third
+# value: 13.5 on the measured prints.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
@@ -49,8 +49,8 @@ def refine_around_defects(
     """Return the fit without the defects, and the defects, bool (ny, nx) of the layout; or the plain fit if
     there are none.
 
-    Every round starts from the coarse warp, which is robust. It finds the defects under the last warp and
-    fits the warp to the rest, until the corners of the warp no longer move.
+    Every round starts from the coarse warp, which is robust. The round finds the defects under the last warp
+    and fits the warp to the rest, until the corners of the warp no longer move.
 
     Args:
         plain: ``refine_pyramid(scan, layout_level, start, model)``.

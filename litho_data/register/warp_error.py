@@ -23,9 +23,10 @@ _CLEAR = 6.0**0.5
 # effect takes it for a surface. The surface is similar in neighbouring blocks, so the jackknife does not see
 # the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
-# Within a cell's width of the layout's border, a print has other surroundings than inside. Their effect is
-# the same on all four sides and in all blocks there, and changes the magnification by more than the jackknife
-# states. A field of this many cells keeps two thirds of its area without the outermost cells.
+# Within a cell's width of the layout's border, a print has other surroundings than inside. The effect of
+# these surroundings is the same on all four sides and in all blocks there, and changes the magnification by
+# more than the jackknife states. A field of this many cells keeps two thirds of its area without the
+# outermost cells.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
@@ -51,8 +52,9 @@ class WarpError:
         """Return the mean square of the surface that the heights contain in addition to the print.
 
         The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
-        Levelling has removed a surface not of the scan but of the print with its roughness. That part is in
-        the error of the fit and no longer in the heights, so after levelling the two squares add up.
+        Levelling has removed a surface not of the scan but of the print with its roughness. The print's part
+        of that surface is in the error of the fit and no longer in the heights, so after levelling the two
+        squares add up.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2

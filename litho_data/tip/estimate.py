@@ -23,8 +23,8 @@ class ScanUnderTip(Record):
     """One scan: the share of pixels that the tip touched, and the wavelength below which the scan may show
     the tip.
 
-    Both are None if the image sets no bound on the tip; ``resolution_um`` is also None if the tip does not
-    limit it.
+    Both values are None if the image sets no bound on the tip; ``resolution_um`` is also None if the tip does
+    not limit it.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """A fab for films that are written by an electron beam or through a lens, etched, and seen in an electron
 microscope.
 
-It shares no code with the models: scattering is a product of spectra, a lens sums the images of the points of
-its source, and etching shifts the distance from an edge.
+The fab shares no code with the models: scattering is a product of spectra, a lens sums the images of the
+points of its source, and etching shifts the distance from an edge.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from litho_data.foundation.kinds import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
 # The spectrum of the measured prints' fine residual: a band of line-shaped features 0.45 µm apart across the
-# hatch direction, and a slower part. Both are long along the hatch lines.
+# hatch direction, and a slower part. Both parts are long along the hatch lines.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55

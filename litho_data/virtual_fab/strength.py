@@ -36,8 +36,8 @@ def strength_for_rms(
 ) -> KnobStrength:
     """Find the strength at which a knob changes the noise-free scans by ``rms_nm``.
 
-    The rms is that of `knob_rms_nm`. It grows with the strength, so the strength is found by interval search
-    within the knob's range.
+    The rms is that of `knob_rms_nm`. This rms grows with the strength, so the strength is found by interval
+    search within the knob's range.
 
     Args:
         name: knob.

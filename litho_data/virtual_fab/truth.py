@@ -67,8 +67,8 @@ class Truth(Result):
     """The record `truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as
     ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid. ``settings`` contains further settings of the run; None in
-    older files.
+    Both files contain heights in µm on the layout grid. ``settings`` contains further settings of the run;
+    None in older files.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"

@@ -44,8 +44,8 @@ def with_marks(
 ) -> tuple[np.ndarray, Marks]:
     """Add an F and a square of the highest level to the right of a level map (size, size).
 
-    Both are at least the printer's reach away from the element and from each other, so that none changes the
-    print of another. Everything lies on whole cells.
+    F and square are at least the printer's reach away from the element and from each other, so that none
+    changes the print of another. Everything lies on whole cells.
 
     Args:
         guard_um: reach of the printer, µm.

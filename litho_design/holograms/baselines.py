@@ -29,9 +29,9 @@ def hologram_baselines(
     """Return the scores of a black image and of ideal elements in the optics of ``bench``, by name.
 
     ``diffraction-limited``: an element of free amplitude and phase, found by forty Gerchberg-Saxton steps,
-    whose image has a flat phase. ``continuous phase``: one phase per cell, without printer and levels. It
-    starts from Gerchberg-Saxton and takes a hundred steps down the design's own loss, which is among the
-    scores. ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
+    whose image has a flat phase. ``continuous phase``: one phase per cell, without printer and levels. The
+    search starts from Gerchberg-Saxton and takes a hundred steps down the design's own loss, which is among
+    the scores. ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)

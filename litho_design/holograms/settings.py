@@ -53,11 +53,11 @@ def hologram_settings(
     """Return a preset of the hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
 
     ``paper``: as printed in the paper (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
-    iterations at 0.1, expected levels). ``authors``: as in the published code. It has 12 levels, temperature
-    1, wavelength 0.633 and index step 0.545; after more than ten iterations without progress the rate falls
-    to a tenth. The code's efficiency term is constant and therefore left out. docs/from_the_authors_code.md
-    lists what is not reproduced of that code. ``default``: one height per cell from a Gerchberg-Saxton start,
-    followed by a polish of the printable layout.
+    iterations at 0.1, expected levels). ``authors``: as in the published code, which has 12 levels,
+    temperature 1, wavelength 0.633 and index step 0.545. After more than ten iterations without progress the
+    rate falls to a tenth. The code's efficiency term is constant and therefore left out.
+    docs/from_the_authors_code.md lists what is not reproduced of that code. ``default``: one height per cell
+    from a Gerchberg-Saxton start, followed by a polish of the printable layout.
 
     Args:
         variant: the preset; a ``variant`` in the changes replaces it.

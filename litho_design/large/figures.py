@@ -1,7 +1,7 @@
 """Score an image of any size, in memory or on disk, one band of rows at a time.
 
-The figures have the names and meanings of ``HologramScore``. Those that need the whole image at once (camera,
-resolved target, uniformity) are left out.
+The figures have the names and meanings of ``HologramScore``. Figures that need the whole image at once
+(camera, resolved target, uniformity) are left out.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
     ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"`` searches with
-    a strip through the centre and the ring propagator instead of the whole plane. It needs a circular
-    aperture and a ring layout; scores always use the plane.
+    a strip through the centre and the ring propagator instead of the whole plane. The radial path needs a
+    circular aperture and a ring layout; scores always use the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})

@@ -105,9 +105,10 @@ def element_field(
     """Return the wave just behind a phase element that a plane wave of unit power illuminates.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
-    It is multiplied by a Gaussian beam and the wave of a near point if the optics have them, and scaled so
-    that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are therefore a share
-    of the incident power. For a thick element in air, ``wave_through_relief`` replaces the phase.
+    This wave is multiplied by a Gaussian beam and the wave of a near point if the optics have them, and
+    scaled so that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are
+    therefore a share of the incident power. For a thick element in air, ``wave_through_relief`` replaces the
+    phase.
 
     Args:
         height_um: real (..., ny, nx), µm.

@@ -40,9 +40,9 @@ def gerchberg_saxton(
     adjoint sends the correction back, and the result is projected on the phases of the element: u' = Pi(u +
     P^H (a exp(j arg P u) - P u)). The norm of P is at most one, so this step majorises the squared amplitude
     error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al.
-    2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing. It gains uniformity
-    but loses the guarantee. The start phases are half a turn, the middle of levels that make a full wave,
-    plus or minus up to a radian.
+    2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing. This form gains
+    uniformity but loses the guarantee that the error never rises. The start phases are half a turn, the
+    middle of levels that make a full wave, plus or minus up to a radian.
 
     Args:
         propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.

@@ -1,7 +1,7 @@
 """The virtual fab as a judge: it prints finished layouts, but has no gradients to design with.
 
-The fab shares no code with the models and includes the effects that were hidden in their training prints. It
-therefore prints what the machine would have printed.
+The fab shares no code with the models and includes the effects that were hidden in their training prints. The
+fab therefore prints what the machine would have printed.
 """
 
 from __future__ import annotations

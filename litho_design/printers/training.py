@@ -27,9 +27,9 @@ _ALLOWED_SHARE = 0.005
 class OutOfDistribution(Record):
     """The distance of a layout from the model's training layouts.
 
-    It consists of two total-variation distances: between histograms of levels, and between histograms of the
-    steps of neighbouring pixels. ``unusual`` says what the layout has much more of than the training layouts.
-    Steps are absent if the model's card has none.
+    The distance consists of two total-variation distances: between histograms of levels, and between
+    histograms of the steps of neighbouring pixels. ``unusual`` says what the layout has much more of than the
+    training layouts. Steps are absent if the model's card has none.
     """
 
     # Older designs also hold scores of a layout closer to the training layouts.
@@ -75,8 +75,8 @@ def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
 
     For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
     neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
-    training layouts. It is 0 if the card has no histogram. A sum of tails, unlike a sum of shares, also pulls
-    back a pixel that is several levels outside.
+    training layouts. If the card has no histogram, the result is 0. A sum of tails, unlike a sum of shares,
+    also pulls back a pixel that is several levels outside.
     """
     total = level.new_zeros(())
     trained, trained_steps = (

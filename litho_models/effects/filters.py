@@ -62,7 +62,7 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
     """Return the transfer function of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential
     tail of length l.
 
-    It is analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
+    The function is analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
     """
     difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
     return 1 / (1 + length_um / pitch_um * difference)

@@ -1,8 +1,8 @@
 """Laws: short formulas of height, slopes, surroundings, position and order.
 
 A law is an effect with one strength (and the position of a jump), so the same code screens, fits, judges and
-applies laws. A law states how the height departs from the model, not why. Tables have many strengths. They
-follow any dependence on their covariate and explain nothing.
+applies laws. A law states how the height departs from the model, not why. Tables have many strengths. A table
+follows any dependence on its covariate and explains nothing.
 """
 
 from __future__ import annotations

@@ -14,8 +14,9 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Relative to the mean square of each feature after the scans' own terms are removed. It affects only weights
-# that the scans cannot distinguish. On the measured prints all values from 1e-6 to 1e-4 give the same result.
+# Relative to the mean square of each feature after the scans' own terms are removed. The ridge affects only
+# weights that the scans cannot distinguish. On the measured prints all values from 1e-6 to 1e-4 give the same
+# result.
 RIDGE = 1e-5
 # Number of fitted pixels of each scan, on a square grid; twice as many predict the measured prints equally
 # well. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take at most

@@ -51,12 +51,12 @@ class CardMetric(Record):
 class ModelCard(RunFacts, Result):
     """Everything needed to load, use and judge a frozen model.
 
-    ``background`` is the mean contribution of the microscope to the training scans. It is used only for
-    comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each fitted
-    value on a bound of its range to that bound. ``baseline`` contains the figures (``ScanFigures``) of the
-    scans from which the model was made; ``litho-models check`` compares new prints with them. ``attributed``
-    says to which side each effect of undetermined role was attributed when the model was frozen; older cards
-    list those of the printer in ``declared_processes``.
+    ``background`` is the mean contribution of the microscope to the training scans. This background is used
+    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each
+    fitted value on a bound of its range to that bound. ``baseline`` contains the figures (``ScanFigures``) of
+    the scans from which the model was made; ``litho-models check`` compares new prints with them.
+    ``attributed`` says to which side each effect of undetermined role was attributed when the model was
+    frozen; older cards list those of the printer in ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

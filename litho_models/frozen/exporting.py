@@ -32,7 +32,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
     """Write a frozen model as a program for layouts of one size; return the largest difference, µm.
 
     The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. The program
-    checks neither pitch nor range. Its metadata contains both (``card.json`` of a ``.pt2``,
+    checks neither pitch nor range. The program's metadata contains both (``card.json`` of a ``.pt2``,
     ``metadata_props`` of ONNX).
 
     Args:
@@ -69,8 +69,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 class _Numbers(TorchDispatchMode):
     """The Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
-    They are the radii of kernels, which follow from widths, and the ends of tables. Both follow from the
-    weights alone, so a program may contain them as constants.
+    These numbers are the radii of kernels, which follow from widths, and the ends of tables. Radii and ends
+    follow from the weights alone, so a program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):

@@ -3,8 +3,8 @@
 The search for causes is run with each base model, and the base models are compared with their causes
 included.
 
-``close`` is an estimator. It makes choices and fits on the given scans, and its result predicts any other
-scan. To judge the choices on some scans, call ``close`` on the others.
+``close`` is an estimator. The function makes choices and fits on the given scans, and its result predicts any
+other scan. To judge the choices on some scans, call ``close`` on the others.
 """
 
 from __future__ import annotations

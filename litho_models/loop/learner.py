@@ -1,7 +1,7 @@
 """Estimate how much of a residual could still be learned, by a cross-validated ridge regression.
 
-The ridge uses features of layout and position. The ridge names no cause and is part of no model. It shows
-whether the residual has structure, and how large this structure is compared with a named cause.
+The ridge uses features of layout and position. The ridge names no cause and is part of no model. The ridge
+shows whether the residual has structure, and how large this structure is compared with a named cause.
 """
 
 from __future__ import annotations

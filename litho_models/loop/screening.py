@@ -1,8 +1,8 @@
 """Predict the held-out gain of every candidate from its derivative at the current model.
 
 A candidate is a set of columns: secants of an effect at some of its parameters, or maps along a covariate.
-Its strength is common to all scans or differs by group. The computation needs only inner products from each
-scan.
+The strength of a candidate is common to all scans or differs by group. The computation needs only inner
+products from each scan.
 """
 
 from __future__ import annotations

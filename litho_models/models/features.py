@@ -188,8 +188,8 @@ class RandomFeatures(Features):
     """``Features`` plus tanh(V z + c), where z are the standardised simple features; V and c are random and
     fixed.
 
-    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
-    learn more than products of two features, but still in closed form.
+    The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). Such a
+    network can learn more than products of two features, but still in closed form.
     """
 
     name = "random-features"

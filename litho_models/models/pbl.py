@@ -1,6 +1,6 @@
 """PBL: physics-based learning, the paper's simulator, with networks for the unknown steps of the process.
 
-It chains an optical blur of fixed width, a pointwise network (exposure threshold), a diffusion blur of
+PBL chains an optical blur of fixed width, a pointwise network (exposure threshold), a diffusion blur of
 learned width, a pointwise network (shrinkage) and an areawise network (everything else); see
 arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model".
 """
@@ -102,12 +102,12 @@ class Pbl(Simulator):
     """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
 
     With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I), g_shrink = 1 +
-    net, g_mismatch(H) = H + net(H). Their last layers are zero at the start.
+    net, g_mismatch(H) = H + net(H). The last layers of these networks are zero at the start.
 
     The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
     the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
     height along x on the measured map. ``scan_axis`` is fitted together with the chain, so that the chain
-    does not learn this influence. It is left out of ``printer()``.
+    does not learn this influence. ``scan_axis`` is left out of ``printer()``.
     """
 
     name = "pbl"

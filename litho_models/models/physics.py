@@ -1,6 +1,6 @@
 """Physics: the paper's parameterised simulator, with five or six physical values.
 
-It chains optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
+The model chains optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
 shrinkage and height bias; see arXiv:2309.17343, appendix "Parameterized physics model".
 """
 
@@ -170,8 +170,8 @@ class Physics(Simulator):
     def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
         return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
-    # The methods below take the values as arguments. They are computed once per pass, because in forward mode
-    # every operation is slow.
+    # The methods below take the values as arguments. The values are computed once per pass, because in
+    # forward mode every operation is slow.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())

@@ -84,7 +84,8 @@ class Calibration(Record):
 class SigmaBin(Record):
     """The measured and predicted spread, and its coverage, for pixels within one range of one covariate.
 
-    It has the coverage at 68 and 95 % with 95 % intervals over prints, and ENCE and AUSE within the group.
+    Coverage is given at 68 and 95 %, with 95 % intervals over prints; ENCE and AUSE are taken within the
+    group.
     """
 
     model_config = _OLDER

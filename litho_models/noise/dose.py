@@ -1,7 +1,8 @@
 """Evaluate the dose matrix: height, roughness and lost steps against dose, and the recommended dose.
 
-This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
-that state a dose, of step ladders or of any layout with areas of one level wider than the printer's blur.
+This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). The search
+uses scans that state a dose, of step ladders or of any layout with areas of one level wider than the
+printer's blur.
 """
 
 from collections.abc import Sequence

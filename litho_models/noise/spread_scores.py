@@ -96,9 +96,9 @@ def sparsification_error(residual: Array, sigma: Array) -> float:
     """Return AUSE, the excess of the mean ``|r|`` over the best possible while the pixels of largest σ are
     removed.
 
-    It is the area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of all
-    pixels; 0 if σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels with the same
-    σ count with their mean, so that their order does not matter.
+    AUSE is the area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of
+    all pixels; it is 0 if σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels with
+    the same σ count with their mean, so that their order does not matter.
 
     Args:
         residual, sigma: (pixels,), one unit; not all residuals zero.

@@ -52,7 +52,7 @@ def usual_background(film: bool) -> BackgroundUse:
 class NuisanceProtocol(Record):
     """The terms that are removed from scans before scoring, and the pixels to which they are fitted.
 
-    ``k`` is the number of smooth terms per scan. It excludes the effective number of line offsets of
+    ``k`` is the number of smooth terms per scan. ``k`` excludes the effective number of line offsets of
     ``full+rows``, which depends on the prediction (``PolicyError.k``). ``background`` is ``training`` if
     predictions include the smooth background of the training scans, and ``shared`` if they include the whole
     measurement model. No part of it is fitted to the scored scan. ``border_px`` is the number of pixels left

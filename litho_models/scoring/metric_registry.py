@@ -77,8 +77,8 @@ def register_metric(
     """Add a metric to every evaluation and benchmark made from now on in this process.
 
     ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan``, the predicted map, and
-    measured minus predicted heights without the per-scan terms, (ny, nx) in µm, NaN where not scored. It
-    returns a number, or None if there is nothing to measure. Example::
+    measured minus predicted heights without the per-scan terms, (ny, nx) in µm, NaN where not scored. The
+    function returns a number, or None if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),

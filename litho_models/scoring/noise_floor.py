@@ -1,7 +1,7 @@
 """The noise floor of a dataset: the smallest possible error of any model, for each set of terms.
 
-It is measured on flat or repeated prints if there are any. Otherwise it is estimated from the out-of-fold
-residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
+The floor is measured on flat or repeated prints if there are any. Otherwise it is estimated from the
+out-of-fold residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
 """
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -112,8 +112,8 @@ class ModelScores(MetricValues):
     """All scores of one model: means over scans, sums of counts, and intervals from resampled scans.
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
-    have no smooth terms themselves. It is empty if the protocol has no background. ``phase_rms_waves`` is the
-    RMS phase error of light that passes the print.
+    have no smooth terms themselves. This field is empty if the protocol has no background.
+    ``phase_rms_waves`` is the RMS phase error of light that passes the print.
     """
 
     # Older results also contain the spread of line offsets.
