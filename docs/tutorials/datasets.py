@@ -1,10 +1,9 @@
 # %% [markdown]
 # # From scans to a dataset
 #
-# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset
-# in which every scan lies on its layout, pixel by pixel, and which records where each number comes from. Here
-# the scans come from the built-in virtual fab; for your own, only the first step differs
-# ([how](../own_data.md)).
+# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset. In it
+# every scan lies on its layout, pixel by pixel, and the origin of every number is recorded. Here the scans come from
+# the built-in virtual fab; for [your own scans](../own_data.md) only the first step differs.
 
 # %%
 import litho_data
@@ -13,9 +12,9 @@ card = litho_data.simulate("campaign", count=6, size_px=160, seed=3)
 print(card)
 
 # %% [markdown]
-# `card.toml` says which file is a scan, which layout belongs to it, and what the files do not say themselves: pitch,
-# height of a level, units. The scans are what an instrument writes: tilted, bowed, slightly rotated, with an unknown
-# zero. Read one:
+# `card.toml` says which files are scans, which layout belongs to each, and what the files do not state: pitch, height
+# of a level, units. The scans are what an instrument writes: tilted, bowed, slightly rotated, with an unknown zero.
+# Read one:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -23,17 +22,17 @@ low, high = scan.height_um.min(), scan.height_um.max()
 print(f"{scan.name}: {scan.height_um.shape} pixels, heights {low:.2f} … {high:.2f} µm")
 
 # %% [markdown]
-# One call reads all of them, finds each on its layout and stores the result with its history. A levelling
-# recipe, if the card names one, is applied on the way.
+# One call reads all scans, registers each on its layout and stores the result with its history. If the card names a
+# levelling recipe, it is applied on the way.
 
 # %%
 result = litho_data.build_dataset(card, "prints.zarr")
 print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
 
 # %% [markdown]
-# The quality table tells how well each scan fits its layout. `ncc_after` is the correlation of height and
-# layout once registered, `tre_median_nm` the distance between matching details that were kept out of the fit
-# ([what is good](../registration.md)).
+# The quality table shows how well each scan fits its layout. `ncc_after` is the correlation of height and layout
+# after registration. `tre_median_nm` is the distance between matching details that the fit did not use ([good
+# values](../registration.md)).
 
 # %%
 store = litho_data.open_store("prints.zarr")
@@ -66,8 +65,8 @@ for axes, (title, (image, scale)) in zip(figure.subplots(1, 3), panels.items(), 
 figure
 
 # %% [markdown]
-# The print is flatter and rounder than its layout: a model of the printer has to learn that. Before you pass
-# the dataset on, make sure that nothing has changed since it was built:
+# The print is flatter and rounder than its layout. A model of the printer has to learn this difference. Before you
+# pass the dataset on, make sure that nothing has changed since it was built:
 
 # %%
 checked = litho_data.verify("prints.zarr")
@@ -76,5 +75,5 @@ print(
 )
 
 # %% [markdown]
-# `prints.zarr` opens with `xarray.open_zarr` as well, without this package. Next: [which model predicts these prints
+# `xarray.open_zarr` also opens `prints.zarr`, without this package. Next: [which model predicts these prints
 # best](models.md), [how levelling works](../levelling.md), [what is in the file](../dataset_store.md).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Which model predicts best?
 #
-# You want to know which model of the printer to trust, and by how much. By the end of this page you have compared
-# three on scans that none of them was trained on, with intervals, and know how much of the error is noise.
+# You want to know which model of the printer predicts best, and by how much. On this page you compare three models on
+# scans that none of them was trained on. You get intervals, and learn how much of the error is noise.
 
 # %%
 import litho_data
@@ -12,9 +12,9 @@ card = litho_data.simulate("campaign", count=8, size_px=128, seed=0)
 built = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
-# `benchmark` deals the scans into folds. Each fold is predicted by models trained on the others; locked scans are
-# in none. The error is the mean absolute difference of measured and predicted height once the unknown zero of
-# each scan is taken out ([why](../evaluation.md#two-errors)).
+# `benchmark` deals the scans into folds. Each fold is predicted by models trained on the other folds; no fold
+# contains locked scans. The error is the mean absolute difference of measured and predicted height after the unknown
+# zero of each scan is removed ([why](../evaluation.md#two-errors)).
 
 # %%
 result = litho_models.benchmark("prints.zarr", "benchmark", models=("affine", "linear", "physics"), folds=2)
@@ -23,7 +23,7 @@ for scores in result.scores:
     print(f"{scores.model:8} {scores.mae_datum_free_nm:6.2f} nm   95 % over scans {low:.2f} … {high:.2f}")
 
 # %% [markdown]
-# Intervals that overlap do not mean that two models are alike: they are compared scan by scan.
+# Two models may differ even if their intervals overlap, because they are compared scan by scan.
 
 # %%
 for pair in result.paired:
@@ -33,15 +33,16 @@ for pair in result.paired:
     )
 
 # %% [markdown]
-# Scans of one print are not independent; where there are several prints, the same test over prints is in
-# `pair.over_prints`. And a part of every error is noise that no model can predict:
+# Scans of one print are not independent. If there are several prints, `pair.over_prints` contains the same test over
+# prints. A part of every error is noise that no model can predict:
 
 # %%
 floor = result.noise_floor
 print(f"noise: {floor.mae_at('offset'):.2f} nm ({floor.kind})")
 
 # %% [markdown]
-# The same as bars, one colour per model, as in `benchmark/report.html`, which has all figures and tables:
+# Draw the errors as bars, with one colour per model. `benchmark/report.html` contains this picture and all other
+# figures and tables.
 
 # %%
 from litho_models.evaluation.plots import error_bars
@@ -49,8 +50,8 @@ from litho_models.evaluation.plots import error_bars
 error_bars(result.scores, floor.mae_at("offset"), paper_line=False)
 
 # %% [markdown]
-# Train the one you chose on all scans but the locked ones, and freeze it: a folder with weights and a card,
-# for designs and other people to load.
+# Train the model that you chose on all scans except the locked ones, and freeze it. The result is a folder with
+# weights and a card, which designs and other people can load.
 
 # %%
 litho_models.train("prints.zarr", "physics", "run")

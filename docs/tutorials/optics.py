@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A hologram through the printer
 #
-# You want a printed element to show an image. By the end of this page you have designed one through a model of the
-# printer, judged it with another model, and written the file for the printer. The models come with the package.
+# You want a printed element to show an image. On this page you design such an element through a model of the printer,
+# judge it with another model, and write the file for the printer. The models come with the package.
 
 # %%
 import litho_design
@@ -16,8 +16,9 @@ designs = {
 }
 
 # %% [markdown]
-# `without` was designed for a perfect printer, `with` through a model trained on measured prints. A design's
-# own prediction proves nothing. Let a model that had no part in either print both, and look at the images:
+# `without` was designed for a perfect printer, `with` through a model trained on measured prints. The prediction of a
+# design by its own model proves nothing. Let a model that was used for neither design print both elements, and look
+# at the images:
 
 # %%
 judged = {
@@ -46,9 +47,9 @@ for axes, (title, image) in zip(figure.subplots(1, 3), images.items(), strict=Tr
 figure
 
 # %% [markdown]
-# Both are predictions. What counts is a photograph of the print; `litho_design.score` takes it, or an AFM
-# scan, in place of the model. To print it, export the layout: an image of levels, with a sidecar that gives
-# heights and size and reads it back.
+# Both images are predictions. What counts is a photograph of the print: `litho_design.score` accepts a photograph or
+# an AFM scan in place of the model. To print the element, export the layout as an image of levels. Its sidecar states
+# heights and size, so that the file can be read back.
 
 # %%
 print(litho_design.export("with", "png16", "to-printer").name)

@@ -103,8 +103,8 @@ def render(name: str) -> None:
         finally:
             os.chdir(here)
     page.append(
-        f"*This page is what [the script]({name}.py) printed and drew when `render.py` ran it; "
-        f"as a [notebook]({name}.ipynb).*"
+        f"*`render.py` made this page by running [the script]({name}.py). "
+        f"The page is also a [notebook]({name}.ipynb).*"
     )
     (HERE / f"{name}.md").write_text("\n\n".join(page) + "\n", encoding="utf-8")
 

@@ -42,7 +42,9 @@ def mark_scars(
         InputError: thresholds or sizes outside their range, or an unknown sign.
     """
     if low > high:
-        raise InputError("scar parameters", got=f"low {low}, high {high}", wanted="low up to high")
+        raise InputError(
+            "scar parameters", got=f"low {low}, high {high}", wanted="low that does not exceed high"
+        )
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
     scars = np.zeros(z.shape, dtype=bool)
@@ -116,7 +118,7 @@ def _harmonic(z: Array, unknown: Array) -> Array:
     beside = ndimage.binary_dilation(~left_out)
     if set(np.unique(areas[unknown])) - set(np.unique(areas[beside & left_out])):
         raise InputError(
-            "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
+            "a marked area has no measured neighbour", wanted="marks with measured pixels around them"
         )
     known = Topography(np.ma.masked_array(z, left_out), z.shape)
     filled: Array = known.interpolate_undefined_data_with_harmonic_function().heights()

@@ -253,7 +253,9 @@ def _require_enough(
     shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
     if strict and left_out:
         raise InputError(
-            f"{out} not built: {len(left_out)} ids cannot be used", got=shown, wanted="all, with --strict"
+            f"{out} not built: {len(left_out)} ids cannot be used",
+            got=shown,
+            wanted="all ids usable, because of --strict",
         )
     if not records_of_use(list(records.values())):
         raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")

@@ -143,7 +143,7 @@ def _z_scale(one: Mapping[str, Any], scan: Any, name: str) -> tuple[float, float
             f"calibration scan {name}: height of the step",
             got=f"{step.height_nm / 1e3:.4g} µm",
             wanted=f"about {one['known_um']:g} µm",
-            hint="is the unit right, and the file?",
+            hint="check the unit and the file",
         )
     relative = np.hypot(one["uncertainty_um"] / one["known_um"], step.uncertainty_nm / step.height_nm)
     return factor, factor * float(relative)

@@ -120,11 +120,11 @@ def suggest_recipe(
             pictures[job.id].append(height_um)
             warned |= {name: note} if note else {}
     if not pictures:
-        raise InputError("scans to compare recipes on", got=refusal, wanted="one that registers")
+        raise InputError("scans to compare recipes on", got=refusal, wanted="a scan that registers")
     usual = {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
     if not usual:
         raise InputError(
-            "recipes to compare", got="; ".join(warned.values()), wanted="one that can be applied"
+            "recipes to compare", got="; ".join(warned.values()), wanted="a recipe that can be applied"
         )
     best = _best(usual)
     card = _write_card(Path(card_path), best)

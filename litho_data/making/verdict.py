@@ -77,7 +77,7 @@ def require_heights(prints: Sequence[Print], card: Card) -> None:
             "layout.level_height_um",
             got=f"{height_um:g} µm, where the prints rise by {times * height_um:.3g} µm per level",
             wanted="the height of one level in µm",
-            hint="or is scan.unit the wrong one?",
+            hint="or is scan.unit wrong?",
         )
 
 

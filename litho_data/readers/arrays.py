@@ -69,7 +69,7 @@ class Coordinate:
             return None
         steps = np.diff(self.values)
         if not np.allclose(steps, steps.mean(), rtol=_UNEVEN, atol=0) or not steps.mean():
-            raise InputError("coordinates", got="uneven steps", wanted="even ones")
+            raise InputError("coordinates", got="uneven steps", wanted="even steps")
         return abs(float(steps.mean())) * count
 
 

@@ -171,7 +171,7 @@ def _gwl_levels(
     slices = steps.cumsum(1)[:, :-1] / rows_per_px - pedestal_um / slicing_um
     found = slices * slicing_um / level_height_um
     if np.abs(found - np.rint(found)).max() > 1e-6:
-        raise InputError(f"GWL {path}", got="columns between two levels", wanted="whole levels")
+        raise InputError(f"GWL {path}", got="columns that end between two levels", wanted="whole levels")
     return np.rint(found).astype(np.uint8)
 
 
@@ -186,7 +186,7 @@ def read_stl_triangles(path: Path) -> Array:
         int(np.frombuffer(data, "<u4", 1, _STL_HEADER_BYTES)[0]) if len(data) >= _STL_HEADER_BYTES + 4 else -1
     )
     if len(data) != _STL_HEADER_BYTES + 4 + count * _STL.itemsize:
-        raise InputError(f"STL {path}", got=f"{len(data)} bytes", wanted="a whole binary STL")
+        raise InputError(f"STL {path}", got=f"{len(data)} bytes", wanted="a complete binary STL")
     return np.frombuffer(data, _STL, count, _STL_HEADER_BYTES + 4)["corners"]
 
 

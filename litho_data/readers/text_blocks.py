@@ -108,7 +108,7 @@ class Block:
         for text in self.words:
             if _SCALE_IN_WORDS.search(text[:200]):
                 raise InputError(
-                    "a scale in the header", got=repr(text[:60]), wanted="heights in a plain unit"
+                    "a scale in the header", got=repr(text[:60]), wanted="heights in a unit without a scale"
                 )
         return None
 

@@ -68,7 +68,7 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
         return Map(values[1:], corner=True, notes=("its first row, evenly spaced, was taken for an axis",))
     pairs = ((row, body[0]), (column, body[:, 0]))
     if all(len(line) >= _FEWEST_ALONE and _rises(line) and not _rises(beside) for line, beside in pairs):
-        raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even ones")
+        raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even steps")
     ends = ((values[-1, :-1], values[-2, :-1]), (values[:-1, -1], values[:-1, -2]))
     if all((step := _spacing(line)) and not _goes_on(beside, step) for line, beside in ends):
         raise InputError("axes in the last row and column", wanted="axes in the first row and column")

@@ -101,12 +101,12 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
                 raise InputError(
                     f"{path} line {first_line}",
                     got="commas before three digits",
-                    wanted="no marks of thousands",
+                    wanted="no thousands separators",
                 )
             text = text.replace(",", ".")
     if "\t" in text and all(_THOUSANDS.fullmatch(cell.strip()) for cell in re.split(r"[\t\n]", text) if cell):
         got = repr(text[:_SHOWN_CHARACTERS])
-        raise InputError(f"{path} line {first_line}", got=got, wanted="no marks of thousands")
+        raise InputError(f"{path} line {first_line}", got=got, wanted="no thousands separators")
     if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):
         separator = "\t"
     return text, separator

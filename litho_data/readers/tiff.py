@@ -106,7 +106,9 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: 
     if dtype.kind not in "uif":
         raise InputError(f"{what}: type of the values", got=dtype, wanted="integers or real numbers")
     if page.photometric.name in ("PALETTE", "MINISWHITE") and dtype.kind in "ui":
-        raise InputError(f"{what}: values", got=page.photometric.name.lower(), wanted="larger is higher")
+        raise InputError(
+            f"{what}: values", got=page.photometric.name.lower(), wanted="larger values for larger heights"
+        )
     if hidden := [tag.code for tag in page.tags if _may_hold_heights(tag, shape)]:
         raise InputError(f"{what}: heights may be in private tag {hidden[0]} of an unknown maker")
     scale, offset, unit, missing = _calibration(what, page, imagej)
@@ -230,7 +232,7 @@ def single_sample(path: Path, pixels: Array) -> Array:
     """
     if pixels.ndim == 3 and 1 <= pixels.shape[2] <= 4:
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != pixels[..., -1].max()).any():
-            raise InputError(f"{path} has transparent pixels", wanted="an image without them")
+            raise InputError(f"{path} has transparent pixels", wanted="an image without transparent pixels")
         colours = pixels[..., : (pixels.shape[2] - 1) | 1]
         if (colours == colours[..., :1]).all():
             return pixels[..., 0]

@@ -112,7 +112,9 @@ def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
         )
     if not os.path.isdir(folder):
         raise InputError(
-            f"Dask worker {worker.address}", got=f"no folder {folder}", wanted="the files of this machine"
+            f"Dask worker {worker.address}",
+            got=f"no folder {folder}",
+            wanted="the same files as on this machine",
         )
     own, there = ({**one["versions"], "commit": one["commit"]} for one in (software_record(), wanted))
     for package in sorted(own.keys() | there.keys()):

@@ -128,7 +128,7 @@ def _common_pitch(scans: Sequence[Scan]) -> YX:
             )
         if not np.allclose(pitch, pitches[0], rtol=_SAME_PITCH):
             what = f"pitch of {scan.source or scan.name}"
-            raise InputError(what, got=f"{pitch} µm", wanted=f"{pitches[0]} µm, as of the first scan")
+            raise InputError(what, got=f"{pitch} µm", wanted=f"{pitches[0]} µm, as for the first scan")
     return pitches[0]
 
 

@@ -49,7 +49,7 @@ class Plan:
         if self.count < 1 or self.fields_per_print < 1:
             raise InputError(
                 "plan of a virtual-fab run",
-                got=f"{self.count} fields, {self.fields_per_print} a print",
+                got=f"{self.count} fields, {self.fields_per_print} per print",
                 wanted="at least one of each",
             )
         if min(self.size_px) < 32:

@@ -78,11 +78,13 @@ def simulate(
         raise InputError(
             "references",
             got="metadata files-only",
-            wanted="full, because only the table identifies references",
+            wanted="metadata full, because only the table identifies references",
         )
     if references and jobs is not None:
         raise InputError(
-            "references", got="own layouts", wanted="references among the layouts, by their use in the table"
+            "references",
+            got="own layouts",
+            wanted="reference scans marked by their use in the table of the layouts",
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -237,7 +239,7 @@ def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: i
     truth = Truth.read(Path(fab) / "truth")
     if seed == truth.seed:
         raise InputError(
-            "seed", got=seed, wanted="another seed than the earlier run's, as the prints are new"
+            "seed", got=seed, wanted="a seed that differs from the earlier run's, because the prints are new"
         )
     about = load_card(card)
     return simulate(

@@ -65,7 +65,7 @@ def strength_for_rms(
     # Remainders of the size of float32 rounding are no trace of the effect.
     if at_limit < 1e-3:
         raise InputError(
-            f"knob {name}", got="no trace beside offset, gain, plane and bow", wanted="another knob"
+            f"knob {name}", got="no trace in addition to offset, gain, plane and bow", wanted="another knob"
         )
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)

@@ -79,7 +79,9 @@ class Given:
         known = {leaf.path for leaf in leaves(preset)}
         for path, name in self.names.items():
             if name != "--set" and path not in known:
-                raise InputError(name, got=f"the {task} task", wanted="a task that has this setting")
+                raise InputError(
+                    name, got=f"an option of the {task} task", wanted="an option of this command's task"
+                )
         content = {} if self.config is None else read_settings(self.config)
         return flattened(preset, content, f"setting of {self.config}") | flattened(preset, self.options)
 
@@ -129,7 +131,7 @@ def takes_settings(
                 )
             unused = sorted(set(leave_out) & set(words))
             if unused:
-                raise InputError("--set", got=unused[0], wanted="a setting that this command leaves open")
+                raise InputError("--set", got=unused[0], wanted="a setting that this command does not fix")
             names = {path: found[path][0].options[0] for path in options} | dict.fromkeys(words, "--set")
             command(**values, given=Given({**options, **words}, names, config))
 

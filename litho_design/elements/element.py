@@ -168,7 +168,7 @@ class Element(nn.Module):
                 "element for torchoptics", got="no torchoptics", hint="install litholoop[torchoptics]"
             ) from None
         if self.kind != "thin":
-            raise InputError("element for torchoptics", got="a thick element", wanted="a thin one")
+            raise InputError("element for torchoptics", got="a thick element", wanted="a thin element")
         return PrintedElement(self, z=z, offset=offset, unit_um=unit_um)
 
     def _check_map(self, what: str, values: Tensor) -> None:

@@ -206,7 +206,7 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
         if older.name != f"{name}.json" and Sidecar.read(older).layout_sha256 != layout_sha256:
             raise InputError(
                 "output",
-                got=f"{older}, which belongs to another layout",
+                got=f"{older}, an export of another layout",
                 wanted="a folder for this layout only",
             )
 

@@ -34,7 +34,9 @@ def write_stl(
         InputError: no pedestal: level 0 would have no volume.
     """
     if pedestal_um <= 0:
-        raise InputError("pedestal_um", got=pedestal_um, wanted="a positive base for a closed solid")
+        raise InputError(
+            "pedestal_um", got=pedestal_um, wanted="a positive height of the base, for a closed solid"
+        )
     triangles = step_solid(levels[::-1])
     height_um = triangles[..., 2] * level_height_um + pedestal_um
     triangles[..., 2] = np.where(triangles[..., 2] < 0, 0.0, height_um)

@@ -114,7 +114,9 @@ class LensTask(Task):
             return self.make_bench(optics)
         if optics.element == "thick":
             hint = "--set view.path=plane"
-            raise InputError("search path 'radial'", got="a thick element", wanted="a thin one", hint=hint)
+            raise InputError(
+                "search path 'radial'", got="a thick element", wanted="a thin element", hint=hint
+            )
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_print(self, level: Tensor, printer: Printer) -> Tensor:
@@ -254,7 +256,9 @@ def _check(settings: LensSettings) -> None:
         got, wanted = "oblique incidence or a beam", "uniform light along the axis"
         raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
     if optics.propagation == "far-field":
-        raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
+        raise InputError(
+            "propagation of a lens", got="far-field", wanted="auto: a lens has its own focal plane"
+        )
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")
     if settings.task == "direct":

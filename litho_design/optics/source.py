@@ -86,5 +86,5 @@ def require_one_wave(optics: Optics, what: str) -> None:
             f"source of {what}",
             got=f"bandwidth {optics.bandwidth_um:g} µm, sine {optics.source_sine:g}, distance "
             f"{optics.source_distance_um:g} µm",
-            wanted="a far point of one colour: 0, 0, 0",
+            wanted="a distant point source of one colour (0, 0, 0)",
         )

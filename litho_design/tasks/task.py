@@ -344,7 +344,7 @@ def register_task(task: type[Task]) -> type[Task]:
     name = getattr(task, "name", "")
     known = _TASKS.get(name)
     if not name or (known is not None and known.__qualname__ != task.__qualname__):
-        raise InputError("name of a task", got=repr(name), wanted="one that no other task has")
+        raise InputError("name of a task", got=repr(name), wanted="a name that no other task has")
     _TASKS[name] = task
     return task
 

@@ -185,5 +185,8 @@ def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Se
     both = sorted(set(arms) & set(judges))
     if both:
         raise InputError(
-            "judges", got=f"{both[0]!r} twice", wanted="names that no arm has", hint="arms judge anyway"
+            "judges",
+            got=f"{both[0]!r} twice",
+            wanted="judges with names that no arm has",
+            hint="the models of the arms judge anyway",
         )

@@ -199,7 +199,7 @@ def _print_off(
     first = load_design(after)
     if first.record.layout != settings.layout:
         raise InputError(
-            f"design {after}", got="another layout", wanted="the size, pitch and levels of this one"
+            f"design {after}", got="another layout", wanted="a design with the same size, pitch and levels"
         )
     printed_um, _ = measured_print(first, scan)
     blur_px = settings.off_blur_um / settings.layout.pitch_um
@@ -275,7 +275,7 @@ def _alone(how: How, *objects: Any) -> How:
     """
     if how.get("robust") or objects or how.get("judges"):
         got = "objects or judges"
-        raise InputError("large element", got=got, wanted="one design through one model")
+        raise InputError("large element", got=got, wanted="only one model and no judges")
     return {**how, "judges": ()}
 
 

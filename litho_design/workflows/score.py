@@ -57,7 +57,7 @@ def score(
     if band_px is not None or record.in_rings:
         if in_memory or any(one is not None for one in (scan, camera, element)):
             given = "a scan, a photograph, another element or a design in memory"
-            raise InputError("score of a large element", got=given, wanted="models that score it")
+            raise InputError("score of a large element", got=given, wanted="only models as judges")
         if record.in_rings and band_px is not None:
             raise InputError(
                 "score of a lens in rings", got="bands", wanted="no bands, because rings need no plane"

@@ -197,6 +197,6 @@ def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[Print
         raise InputError(
             "output",
             got=f"{folder}, which holds a benchmark of {'; '.join(held)}",
-            wanted="a folder of its own",
+            wanted="another folder",
             hint="choose another --out",
         )

@@ -85,7 +85,7 @@ def reading_kept(folder: Path) -> Iterator[None]:
         raise InputError(
             f"cannot read what an earlier call kept in {folder}",
             got=f"{type(error).__name__} ({said})",
-            wanted="its files as they were written",
+            wanted="the files unchanged",
             hint=f"delete {folder} and run again",
         ) from error
 
@@ -129,8 +129,8 @@ class CheckpointFolder:
         if key != self._key:
             raise InputError(
                 f"checkpoint in {self.path}",
-                got="one of another model, configuration or dataset",
-                wanted="the run that is being continued",
+                got="a checkpoint of another model, configuration or dataset",
+                wanted="a checkpoint of this run",
                 hint="choose another --out, or delete the folder",
             )
         return history

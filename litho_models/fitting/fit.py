@@ -75,9 +75,7 @@ def fit_with_record(
     torch.manual_seed(config.seed)
     fields = {**config.model, **(model_fields or {})}
     for name in geometry.keys() & fields.keys():
-        raise InputError(
-            f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
-        )
+        raise InputError(f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as in the scans")
     model = build_model(model_name, config.variant, **geometry, **fields)
     # The folder is checked even if the model writes no checkpoint, because it may contain another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))

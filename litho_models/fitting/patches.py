@@ -61,7 +61,9 @@ class PatchDataset(Dataset[Patch]):
             raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the smallest scan")
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
-            raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one per scan")
+            raise InputError(
+                "patches", got=got, wanted="a margin of 0 or more, and at least one patch per scan"
+            )
         self.size_px, self.margin_px, self.per_scan, self.seed = size_px, margin_px, per_scan, seed
 
     @property
@@ -97,7 +99,7 @@ def _chosen(store: Store, ids: Sequence[str] | None) -> list[PrintedScan]:
         raise InputError("ids of patches", got=got, wanted="scans of the store that are not locked")
     wanted = [store.scan(scan_id) for scan_id in (open_ids if ids is None else ids)]
     if not wanted:
-        raise InputError("patches", got="no scan", wanted="at least one that is not locked")
+        raise InputError("patches", got="no scan", wanted="at least one scan that is not locked")
     return wanted
 
 

@@ -108,7 +108,7 @@ def _diverging(model: Simulator, last: int) -> Iterator[None]:
 def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
-        got=f"weights or errors beyond all heights at step {step}",
+        got=f"weights or errors that became infinite or NaN at step {step}",
         wanted="steps that converge",
         hint="try a smaller learning_rate",
     )

@@ -140,10 +140,10 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
             complex_numbers = "complex" in str(error)
             raise InputError(
                 f"model {facts['name']} to export to ONNX",
-                got="complex numbers, which its operators do not have"
+                got="complex numbers, which ONNX does not support"
                 if complex_numbers
                 else type(error).__name__,
-                hint="a .pt2 holds every model",
+                hint="the .pt2 format can hold every model",
             ) from None
     assert written is not None
     written.model.metadata_props.update({key: json.dumps(value) for key, value in facts.items()})

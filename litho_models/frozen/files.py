@@ -144,7 +144,9 @@ def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
     try:
         state = load_file(weights)
     except SafetensorError as error:
-        raise InputError(f"weights in {weights}", got=str(error), wanted=f"those of {card.model}") from error
+        raise InputError(
+            f"weights in {weights}", got=str(error), wanted=f"the weights of {card.model}"
+        ) from error
     _check_numbers(state, f"weights in {weights}")
     simulator = _empty_simulator(card, weights)
     wanted = simulator.state_dict()
@@ -201,6 +203,6 @@ def _check_effects(card: ModelCard) -> None:
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",
                 wanted="an effect of the printer",
-                hint="`litho-models freeze --attribute printer` makes an undetermined effect one",
+                hint="`litho-models freeze --attribute printer` gives an undetermined effect to the printer",
             )
         effect.require_in_range(values)

@@ -137,7 +137,7 @@ class FrozenSimulator(nn.Module):
             )
         if layout_um.ndim < 2 or not layout_um.numel():
             shape = tuple(layout_um.shape)
-            raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), none of them 0")
+            raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), all larger than 0")
         dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
         fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
         # Fields are printed one after the other, so that a stack needs no more memory than one field.
@@ -193,14 +193,17 @@ class FrozenSimulator(nn.Module):
             )
         if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
             raise InputError(
-                "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), none of them 0"
+                "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), all larger than 0"
             )
         # A model without weights takes every floating-point layout.
         own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
         wanted = next((weight.dtype for weight in self.parameters()), own)
         if layout_um.dtype != wanted:
             raise InputError(
-                "layout", got=layout_um.dtype, wanted=f"{wanted}, as the weights", hint=f"layout.to({wanted})"
+                "layout",
+                got=layout_um.dtype,
+                wanted=f"{wanted}, like the weights",
+                hint=f"layout.to({wanted})",
             )
         if not self.extrapolate:
             self._check_range(layout_um)

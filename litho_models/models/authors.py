@@ -66,7 +66,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         raise InputError(
             f"weights of the authors' {model.name}",
             got=f"missing, unknown or of another size: {', '.join(wrong)}",
-            wanted="their state_dict as a whole",
+            wanted="the complete state_dict",
         )
     # Our models store 1 x 1 convolutions as matrices, and tensors of shape (1,) as plain numbers.
     model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})

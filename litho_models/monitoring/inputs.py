@@ -43,7 +43,7 @@ def gather(
             in common, or too few prints.
     """
     if reference is not None and new:
-        raise InputError("reference", got="a store and --new", wanted="one of the two")
+        raise InputError("reference", got="both a store and --new", wanted="only one of the two")
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     dropped: list[str] = []
     if reference is not None:
@@ -62,7 +62,9 @@ def gather(
     _check_reference(found.reference, frozen)
     if not found.new:
         raise InputError(
-            f"scans of {dataset.path}", got="none to compare", wanted="one of the reference's dose"
+            f"scans of {dataset.path}",
+            got="none to compare",
+            wanted="at least one with the dose of the reference",
         )
     return found
 
@@ -84,7 +86,10 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
         )
     if made_of_these_prints(frozen, dataset):
         raise InputError(
-            f"store {dataset.path}", got="the prints that the model was made of", wanted="new ones", hint=hint
+            f"store {dataset.path}",
+            got="the prints from which the model was made",
+            wanted="new prints",
+            hint=hint,
         )
     try:
         return [ScanFigures.model_validate(row) for row in frozen.card["baseline"]]
@@ -126,7 +131,7 @@ def _check_apart(dataset: Store, other: Store) -> None:
         raise InputError(
             "reference",
             got=f"scans of {dataset.path} in {other.path} too",
-            wanted="other prints than those checked",
+            wanted="prints that are not checked",
             hint="--new PRINT checks some prints of a store against its others",
         )
 
@@ -137,7 +142,7 @@ def _check_reference(rows: Sequence[ScanFigures], frozen: FrozenSimulator) -> No
         raise InputError(
             "prints in the reference",
             got=prints,
-            wanted=f"{FEWEST_REFERENCE_PRINTS} at least: fewer do not tell how much unchanged prints differ",
+            wanted=f"{FEWEST_REFERENCE_PRINTS} at least, to show how much unchanged prints differ",
         )
     gain = float(np.median([row.gain for row in rows]))
     if not _OWN_GAIN[0] < gain < _OWN_GAIN[1] or min(row.gain for row in rows) <= 0:
@@ -145,5 +150,5 @@ def _check_reference(rows: Sequence[ScanFigures], frozen: FrozenSimulator) -> No
             f"reference prints against model {frozen.name}",
             got=f"{gain:.2f} times the predicted heights",
             wanted=f"{_OWN_GAIN[0]:g} to {_OWN_GAIN[1]:g}",
-            hint="it is the model of another printer, or scans and layouts do not belong together",
+            hint="the model describes another printer, or scans and layouts do not belong together",
         )

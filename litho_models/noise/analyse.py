@@ -44,7 +44,7 @@ def analyse_noise(
         InputError: a store or residuals that cannot be read or do not match.
     """
     if model is not None and residuals is None:
-        raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
+        raise InputError("model", got=f"{model} without residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
         every = dataset.scans()

@@ -142,7 +142,9 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     """
     scans, residuals = found.scans, found.residuals_nm
     if len(scans) < 3:
-        raise InputError("scans for a calibration", got=len(scans), wanted="at least 3, to leave some out")
+        raise InputError(
+            "scans for a calibration", got=len(scans), wanted="at least 3, so that some can be left out"
+        )
     places = [place_maps(scan) for scan in scans]
     drawn = [_sample(residual, seed + number) for number, residual in enumerate(residuals)]
     designs = [

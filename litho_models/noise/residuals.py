@@ -61,7 +61,7 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     elif model is None:
         name, maps, protocol, held_out = _of_frozen(store, folder)
     else:
-        raise InputError("model", got=f"{model} and a frozen one", wanted="a benchmark to choose it from")
+        raise InputError("model", got=f"{model} with a frozen model", wanted="a benchmark to choose it from")
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id in maps]
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")

@@ -109,7 +109,7 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
         raise InputError(
             "residuals for a variance",
             got=f"{square.size} pixels, {np.count_nonzero(square)} not zero",
-            wanted="more than covariates, and not all zero",
+            wanted="more pixels than covariates, and some that are not zero",
         )
     normal = covariates.T @ covariates
     level = np.full(square.size, np.log(square.mean()))

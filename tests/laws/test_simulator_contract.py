@@ -258,7 +258,7 @@ def test_a_frozen_model_takes_layouts_of_its_own_precision_only(name, tmp_path):
     if list(model.parameters()):
         others += [torch.float64, torch.float16, torch.bfloat16]
     for dtype in others:
-        with pytest.raises(InputError, match=r"wanted torch\.float32, as the weights"):
+        with pytest.raises(InputError, match=r"wanted torch\.float32, like the weights"):
             frozen(layout().to(dtype))
     single, double = frozen(layout()), frozen.double()(layout().double())
     assert (single.dtype, double.dtype) == (torch.float32, torch.float64)

@@ -80,7 +80,7 @@ REFUSED: dict[str, tuple[list[str], str]] = {
     "decimal commas between commas": (decimal_commas(","), "decimal commas or commas between cells"),
     "marks of thousands": (
         ["\t".join(f"{int(value * 1e4):,}" for value in row) for row in HEIGHT_UM],
-        "no marks of thousands",
+        "no thousands separators",
     ),
     "errors of a spreadsheet": ([row.replace("0.9000", "#N/A") for row in rows()], "line 1, got '#N/A'"),
     "a row without numbers": (["\t".join(["Bad"] * NX), *rows()], "line 1, got 'Bad'"),

@@ -167,7 +167,7 @@ def test_what_words_say_of_the_heights_is_not_passed_over(tmp_path: Path, head: 
 def test_blanks_between_thousands_make_no_columns(tmp_path: Path) -> None:
     path = tmp_path / "scan.txt"
     path.write_text("\n".join("\t".join(f"1 0{value:05.2f}" for value in 10 * row) for row in HEIGHT_UM))
-    refused(path, "line 1.*no marks of thousands")
+    refused(path, "line 1.*no thousands separators")
 
 
 def test_axes_in_the_last_row_and_column_are_no_heights(tmp_path: Path) -> None:

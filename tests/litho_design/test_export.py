@@ -163,7 +163,7 @@ def test_exports_in_other_formats_stay(tmp_path, design):
     # A print job must not mix two layouts: the sidecar of the other format names another one.
     sidecar = sidecar_path(second)
     sidecar.write_text(sidecar.read_text().replace(import_levels(first)[1].layout_sha256, "0" * 64))
-    with pytest.raises(InputError, match=r"layout\.stl\.json, which belongs to another layout"):
+    with pytest.raises(InputError, match=r"layout\.stl\.json, an export of another layout"):
         export_design(design, "png16", tmp_path / "out")
 
 

@@ -304,10 +304,10 @@ def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
     ("store", "given", "message"),
     [
         ("same", {"reference": "few"}, "prints in the reference, got 3, wanted 4 at least"),
-        ("same", {"reference": "same"}, "scans of .* too, wanted other prints than those checked; --new"),
-        ("same", {"reference": "made", "new": ["12"]}, "got a store and --new, wanted one of the two"),
+        ("same", {"reference": "same"}, "scans of .* too, wanted prints that are not checked; --new"),
+        ("same", {"reference": "made", "new": ["12"]}, "got both a store and --new, wanted only one"),
         ("same", {"new": ["99"]}, "--new, got 99, wanted a print of"),
-        ("made", {}, "got the prints that the model was made of, wanted new ones; --reference"),
+        ("made", {}, "got the prints from which the model was made, wanted new prints; --reference"),
         ("same", {"false_alarms": 0.0}, "rate of false alarms, got 0.0"),
         ("same", {"tolerance": 5.0}, "0.05 is 5 %"),
         ("pitch", {}, "pitch_um for model affine, got 0.2 µm, wanted 0.1 µm"),
