@@ -106,7 +106,7 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str) -> bool:
-    """Return whether the same result has already been begun there."""
+    """Return whether the folder contains an unfinished start of the same result."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # A process that was stopped before it wrote ``begun.json`` has begun nothing.

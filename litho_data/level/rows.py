@@ -96,7 +96,7 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
     An offset of a line moves all of its pixels. The warning names lines that were shifted against their
     neighbour by far more than the noise although many of their pixels do not differ from it; there, a
-    structure moved the others.
+    structure shifted the other pixels.
 
     Args:
         z: (ny, nx) before alignment; ``removed``: what was subtracted from it; lines are rows in both.

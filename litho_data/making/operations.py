@@ -1,6 +1,6 @@
 """The operations that turn raw files into a dataset: pure functions of recorded parameters and inputs.
 
-A build runs them, and ``replay`` runs them again from the record; nothing else makes a stored array.
+A build runs these operations, and ``replay`` repeats them from the record. Only they make stored arrays.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from litho_data.store.schema import DatasetId
 
 
 class LeftOut(Record):
-    """An id that is not in the store, with the reason."""
+    """A scan that is missing from the store, and the reason."""
 
     id: str
     reason: str

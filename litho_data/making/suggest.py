@@ -161,7 +161,7 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Return the rms residual of a free response to the layout, in blocks outside its fit, µm.
+    """Fit heights freely to the layout, and return the rms residual in blocks outside the fit, µm.
 
     Args:
         height_um: (ny, nx), NaN where not measured.

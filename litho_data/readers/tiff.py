@@ -225,7 +225,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
 
 
 def single_sample(path: Path, pixels: Array) -> Array:
-    """Reduce to (ny, nx) from (ny, nx), or from opaque (ny, nx, 1 to 4) with identical colours.
+    """Reduce grey pixels (ny, nx) or (ny, nx, 1 to 4), opaque and with equal colours, to (ny, nx).
 
     Raises:
         InputError: the colours differ, so a pixel has no single value, or pixels are transparent.

@@ -34,7 +34,7 @@ class Refinement:
     ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it maps to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, with gaps filled. ``gram`` (cells_y,
     cells_x, k, k) contains, for each cell of ``CELL_PX`` pixels, the inner products of the regressors (gain,
-    background, warp) and, last, the scan. Any part of the field can be refitted from it without the pixels.
+    background, warp) and, last, the scan. These sums are enough to refit any part of the field.
     """
 
     model: Model

@@ -107,7 +107,7 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Return a target (m, m) at the resolution of an element of the same size, real (m, m).
 
     The target is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
-    where NA is that from the axis to the edge. Beyond the window it is dark.
+    where NA is the sine of the angle from the axis to the edge. Beyond the window it is dark.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):

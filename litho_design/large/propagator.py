@@ -97,7 +97,7 @@ class BandedPropagator:
         return got.reshape(bands.size_px, width)
 
     def _to_rows(self, columns: Tensor) -> Tensor:
-        """Reverse the exchange: (size, own columns) to (own rows, length)."""
+        """Turn the process's columns (size, columns) back into its rows (rows, length)."""
         bands, ranks = self.bands, self.bands.ranks
         if ranks.count == 1:
             return columns

@@ -29,7 +29,7 @@ LensTaskName = Literal["direct", "computational"]
 
 
 class LensView(Record):
-    """Aperture, PSF window and search path of a lens.
+    """Settings that state aperture, PSF window and search path of a lens.
 
     ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"`` searches with
     a strip through the centre and the ring propagator instead of the whole plane. The radial path needs a

@@ -36,7 +36,7 @@ Loop = Callable[[Path, Path], Answer]
 
 
 class Judged(Result):
-    """The board and loop that a folder of judged trials belongs to."""
+    """The board and the loop for which the trials in a folder were judged."""
 
     SCHEMA: ClassVar[str] = "litho-models/board-judged/1"
     FILE_NAME: ClassVar[str] = "judged.json"

@@ -47,7 +47,7 @@ def train_network(
 
     The best round is the one with the smallest error on ``validation``; without validation scans it is the
     last. ``first_predictions_um`` computes the heights of a small model on the training scans, from which the
-    first scan terms are estimated. A run that continues does not call it.
+    first scan terms are estimated. A continued run does not need them.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -157,8 +157,8 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows and, for the record, the weighted absolute error, µm, and the weight,
-    (2,).
+    """Return the loss of some windows; for the record, also return (2,) their weighted absolute error, µm, and
+    weight.
 
     A random crop includes its surroundings or is one tile of the model; a quadrant is an image of its own.
     """

@@ -31,7 +31,7 @@ from litho_models.scan_terms.grouped import ALL
 
 @dataclass(frozen=True)
 class Closed:
-    """The choices and fits made on some scans.
+    """The choices and fits that the loop makes on some of the scans.
 
     Attributes:
         base_name: name of the chosen base; ``rivals``: results of the same search beside the other bases.
@@ -61,7 +61,7 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the scans without what groups of scans share."""
+        """Subtract from each scan what the scans of its group share."""
         return self.base.study
 
     @property
@@ -152,8 +152,9 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 
 
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """Choose among the bases that do as well as the best: the one whose causes the others share, with the
-    fewest parameters.
+    """Choose a base model among those that do as well as the best.
+
+    The chosen base finds causes that the others also find, with the fewest parameters.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {

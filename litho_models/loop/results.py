@@ -1,4 +1,4 @@
-"""Make the record of a loop: errors, strengths with intervals, reasons for rejected effects."""
+"""Make the record of a loop: errors, strengths with intervals, and why effects were rejected."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the base's values by their physical names; return nothing for a base that is not fitted."""
+    """Return the fitted physical values of the base model by name; an unfitted base model has none."""
     base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
         return {}

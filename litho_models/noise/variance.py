@@ -1,7 +1,7 @@
 """Fit σ(x), a log-linear model of a residual's spread by layout and position.
 
 The mean is fitted first and then kept. Then ln s² = X β is fitted to its out-of-fold residuals by maximum
-likelihood, with the tails of Student's t. With two stages the spread cannot excuse errors of the mean. Tens
+likelihood, with the tails of Student's t. In two stages, a wide spread cannot hide errors of the mean. Tens
 of scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
