@@ -157,8 +157,8 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows; for the record, also return (2,) their weighted absolute error, µm, and
-    weight.
+    """Return the loss of some windows; for the record, also return (2,) their weighted absolute error, µm,
+    and weight.
 
     A random crop includes its surroundings or is one tile of the model; a quadrant is an image of its own.
     """

@@ -55,8 +55,8 @@ class NuisanceProtocol(Record):
     ``k`` is the number of smooth terms per scan. ``k`` excludes the effective number of line offsets of
     ``full+rows``, which depends on the prediction (``PolicyError.k``). ``background`` is ``training`` if
     predictions include the smooth background of the training scans, and ``shared`` if they include the whole
-    measurement model. No part of it is fitted to the scored scan. ``border_px``, the number of pixels left out
-    at the edge of a scan, is zero.
+    measurement model. No part of it is fitted to the scored scan. ``border_px``, the number of pixels left
+    out at the edge of a scan, is zero.
     """
 
     policy: Policy = "offset"
