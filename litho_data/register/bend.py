@@ -24,8 +24,8 @@ class Bend:
 
     ``amount`` (2, 3), along x and y, contains the coefficients of u² - 1/3, uv and v² - 1/3. If the scanner
     creeps, ``amount`` is (2, 11), with the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v) in addition. All
-    terms are centred, so the best affine part of a bend over the frame is zero. ``middle`` and ``half`` are the
-    centre and half the size (x, y) of the frame, in the unit of ``amount``; u = (x - middle) / half.
+    terms are centred, so the best affine part of a bend over the frame is zero. ``middle`` and ``half`` are
+    the centre and half the size (x, y) of the frame, in the unit of ``amount``; u = (x - middle) / half.
     """
 
     amount: Array
