@@ -13,8 +13,8 @@ class InputError(ValueError):
     """Bad input: the message is one line that says what is wrong, what was found and wanted, and gives a
     hint.
 
-    The command lines print it without a traceback and exit with code 2; every other exception is a defect of
-    this project. ``got`` may be an exception: the message says why in words.
+    The command lines print the message without a traceback and exit with code 2; every other exception is a
+    defect of this project. ``got`` may be an exception: the message says why in words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):

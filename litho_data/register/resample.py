@@ -78,7 +78,7 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the same share along one axis, for the offsets of consecutive lines along it."""
+    """Return the share of the variance of white line offsets that resampling across the lines leaves."""
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 

@@ -26,7 +26,8 @@ def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """Choose a sixth of the scans, at least one, from different prints if possible; none of one or two scans.
+    """Choose a sixth of the scans, at least one, from different prints if possible; choose none of two or
+    fewer.
 
     Args:
         ids: scan ids; ``print_ids``: the print of each, same length.

@@ -118,7 +118,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Subtract from ``change`` its least-squares fit by the prediction and a quadratic surface, same
+    """Subtract from ``change`` its least-squares fit by the prediction and a quadratic surface; keep the
     shape.
     """
     y, x = (

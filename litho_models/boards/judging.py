@@ -184,7 +184,7 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Return the median relative error of the base's values, without and with the findings.
+    """Return the median relative error of the base model's values, without and with the findings.
 
     Return None if printer or base is not a Physics model.
     """

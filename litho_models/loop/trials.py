@@ -22,7 +22,7 @@ from litho_models.loop.prepared import PreparedScan
 class Trial:
     """Parameter sets of one effect with the same shape and size; their amplitudes are fitted together.
 
-    ``columns`` are the indices of its changes among those of all trials.
+    ``columns`` are the indices of the trial's changes among the changes of all trials.
     """
 
     effect: Effect

@@ -147,12 +147,12 @@ class FigureCheck(Record):
     """One figure of the new prints against the reference; all values except ``mean`` are relative, 0.01 is 1
     %.
 
-    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p of a change.
-    An alarm is raised if it is at most ``alarm_at``, the figure's share of the rate. ``noticeable_step`` is
-    the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10 cases; a fall by r/(1 +
-    r) is noticed equally. ``noticeable_step`` is None beyond a factor of e. ``trend`` is the change per print
-    over all prints. ``measure_again_in`` is the number of prints until the 95 % bound of the drift reaches
-    ``tolerance``.
+    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p value of a
+    change. An alarm is raised if it is at most ``alarm_at``, the figure's share of the rate.
+    ``noticeable_step`` is the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
+    cases; a fall by r/(1 + r) is noticed equally. ``noticeable_step`` is None beyond a factor of e. ``trend``
+    is the change per print over all prints. ``measure_again_in`` is the number of prints until the 95 % bound
+    of the drift reaches ``tolerance``.
     """
 
     name: str

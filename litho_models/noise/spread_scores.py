@@ -93,11 +93,11 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
-    """Return AUSE, the excess of the mean ``|r|`` over the best possible while the pixels of largest σ are
-    removed.
+    """Return AUSE, which states how well σ ranks the pixels by error; 0 is perfect.
 
-    AUSE is the area between the two curves over the removed share, 0 to 1, in units of the mean ``|r|`` of
-    all pixels; it is 0 if σ orders the pixels as ``|r|`` does. Ilg et al. 2018, arXiv:1802.07095. Pixels with
+    Pixels are removed in two orders, largest σ first and largest ``|r|`` first. AUSE is the area between the
+    two curves of the mean ``|r|`` of the rest over the removed share, 0 to 1, in units of the mean ``|r|`` of
+    all pixels. Ilg et al. 2018, arXiv:1802.07095. Pixels with
     the same σ count with their mean, so that their order does not matter.
 
     Args:

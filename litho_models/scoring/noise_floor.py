@@ -42,8 +42,8 @@ class NoiseFloor(Record):
     """The error that noise alone causes; ``kind`` states how it was estimated.
 
     ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``. ``by_policy`` has a floor for each policy; it
-    is empty if only that one is known, and in older result files. The kinds ``lower-bound`` and
-    ``literature`` occur in older files, and the first also in loops on fewer than three scans.
+    is empty in older result files, and if only the floor of ``offset`` is known. The kinds ``lower-bound``
+    and ``literature`` occur in older files, and the first also in loops on fewer than three scans.
     """
 
     mae_nm: float | None
