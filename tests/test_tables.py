@@ -69,6 +69,12 @@ TABLES = {
 }
 
 
+def test_the_meaning_of_a_column_stands_behind_its_name(tmp_path: Path) -> None:
+    page = Page("Rows", words={"mae_nm": ("error (nm)", "how far off")})
+    page.table([Row(scan="P11", mae_nm=1.5)], "All.", "rows.csv")
+    assert "<dt>error (nm)</dt><dd>how far off</dd>" in page.write(tmp_path).read_text()
+
+
 def test_every_table_of_the_product_is_held_by_a_law() -> None:
     files = [file for name in ("data", "models", "design") for file in (ROOT / f"litho_{name}").rglob("*.py")]
     written = re.compile(r'"([a-z_]+?)_?(?:\{[^"]*\})?\.csv"')
@@ -145,6 +151,18 @@ def of_layouts(folder: Path) -> list[dict[str, Any]]:
     return [
         {"level or jump": at, "share of pixels": level, "share of pairs": jump} for at, (level, jump) in rows
     ]
+
+
+def test_graphs_of_layouts_show_shares_by_level_jump_and_frequency(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(Page, "figure", lambda page, figure, caption: shown.append(figure))
+    of_layouts(tmp_path)
+    levels, jumps, power = shown[-1].axes
+    assert [bar.get_height() for bar in levels.patches] == [0.5, 0.3, 0.2]
+    assert [bar.get_height() for bar in jumps.patches] == [0.6, 0.35, 0.05]
+    assert [[*one] for one in power.lines[0].get_data()] == [[0.1, 0.2], [0.7, 0.3]]
 
 
 @pytest.mark.parametrize("made", [of_gratings, of_a_build, of_recipes, of_a_sheet, of_layouts])

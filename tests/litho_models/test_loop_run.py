@@ -81,6 +81,8 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
         patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
         patch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
+        # As if each second of the first fits stood for hours.
+        patch.setattr(closing, "_OVER_FIRST_FITS", 1e5)
         # Of one blur and two numbers.
         patch.setattr(bases, "build_model", lambda *name, **facts: base_model())
         result = close_loop(store, out, base=BASE, folds=2, open_lock_box=True, report=said.append)
@@ -180,6 +182,8 @@ def test_the_page_holds_the_answer_and_nothing_from_elsewhere(closed) -> None:
     assert f"{before.mae_nm:.2f}" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert said[0].startswith("fitting affine-mtf to 10 scans")
+    (estimate,) = (at for at, one in enumerate(said) if one.startswith("estimate: the loop takes about"))
+    assert said[estimate + 1] == "looking for what affine-mtf lacks"
 
 
 def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) -> None:
