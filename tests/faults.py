@@ -245,6 +245,17 @@ FAULTS = [
     Fault("a model's name taken for a loaded one", "litho_design/printers/source.py",
           "if isinstance(item, str):\n            first", "if isinstance(str, item):\n            first",
           "tests/litho_design/test_frozen_printer.py -k as_words"),
+    Fault("one flat scan among others", "litho_models/loop/search.py",
+          "one_level = all(", "one_level = any(", "tests/litho_models/test_loop_search.py -k cannot_test"),
+    Fault("outcomes of the rivals in another order", "litho_models/planning/answers.py",
+          "it is {name}\" for name in names),\n            \"two fit",
+          "it is {name}\" for name in names[::-1]),\n            \"two fit", f"{NEXT} -k waiting"),
+    Fault("a meaning before its name", "litho_data/reports/page.py",
+          '[(column["name"], column["meaning"])', '[(column["meaning"], column["name"])',
+          "tests/test_tables.py -k meaning"),
+    Fault("frequency against power", "litho_data/layouts/statistics_report.py",
+          "step(statistics.frequency_per_um, statistics.power_share,",
+          "step(statistics.power_share, statistics.frequency_per_um,", "tests/test_tables.py -k graphs"),
 ]  # fmt: skip
 
 
