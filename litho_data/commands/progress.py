@@ -112,7 +112,7 @@ def say_estimate(what: str, seconds: float) -> None:
 
 
 def estimate(what: str, seconds: float) -> str:
-    """The line of ``say_estimate``; empty for less than a minute."""
+    """Return the line of ``say_estimate``, or an empty text for less than a minute."""
     if seconds <= _MINUTE_S:
         return ""
     span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"

@@ -70,7 +70,7 @@ class PartialStore:
         self._pieces.mkdir(exist_ok=True)
         if self.store.exists():
             others = [one for one in self.store.iterdir() if one.name != "scans"]
-            # A stopped write of Zarr leaves a file of its own.
+            # If Zarr is stopped while it writes, it leaves a temporary file.
             others += [one for one in (self.store / "scans").glob("*") if one.is_file()]
             for child in others:
                 shutil.rmtree(child) if child.is_dir() else child.unlink()

@@ -30,7 +30,7 @@ from litho_models.loop.search import Cause, Found, describe, search, untestable,
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL
 
-# Time of a loop over that of its first fits: 11 to 33 in four data sets.
+# Ratio of the time of a loop to the time of its first fits: 11 to 33 in four datasets.
 _OVER_FIRST_FITS = 20
 
 
