@@ -70,9 +70,7 @@ def rows(tmp_path_factory):
 
 
 def test_a_correction_is_no_worse_than_none_by_a_judge_that_took_no_part(rows):
-    # Where layouts differ by less than the models err, chance decides: in one of fifteen by more than 5 %.
-    assert sum(over_idle(row) > ALLOWED for row in rows) <= 1
-    assert np.median([over_idle(row) for row in rows]) < 1
+    assert all(over_idle(row) < ALLOWED for row in rows)
     blazes = [over_idle(row, ("best affine",)) for row in rows if row["relief"] == "blaze"]
     assert np.median(blazes) < 1
     assert all(over_idle(row) < 0.8 for row in rows if row["relief"] in ("freeform", "staircase"))
