@@ -34,9 +34,9 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("ssim", "SSIM {}", 3),
     ("si_psnr_window_db", "{} dB inside the signal window", 2),
     ("rms_nm", "{} nm rms from the relief", 1),
-    ("mae_direct", "MAE direct {}", 4),
-    ("mae_design", "MAE design {}", 4),
-    ("mae_calibrated", "MAE calibrated {}", 4),
+    ("mae_direct", "MAE {} on the sensor", 4),
+    ("mae_design", "MAE {} with the designed PSF", 4),
+    ("mae_calibrated", "MAE {} with the print's own PSF", 4),
 )
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # Reflection alone takes 4.6 %.
