@@ -155,5 +155,5 @@ def lock_box_text(split: ScoredSplit) -> str:
         return "The dataset is too small for locked scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
-        return f"Locked scans of the dataset, left out: {len(split.lock_box)}."
-    return f"Locked scans of the dataset are among the scored ones: {', '.join(scored)}."
+        return f"Locked scans, which no training on this dataset uses, are left out: {len(split.lock_box)}."
+    return f"Locked scans, which no training on this dataset uses, are scored too: {', '.join(scored)}."
