@@ -1,1 +1,1 @@
-"""Parts that all packages use: errors, files, hashes, units, records, and facts of a run."""
+"""Parts that all packages use: errors, files, hashes, units, records, and facts about a run."""

@@ -34,7 +34,9 @@ class Record(BaseModel):
 
 
 class Result(Record):
-    """The root of a result file. Subclasses set ``SCHEMA``, ``FILE_NAME``, and ``OLDER`` schemas to read."""
+    """Base of the records that are result files. Subclasses set ``SCHEMA``, ``FILE_NAME``, and ``OLDER``
+    schemas to read.
+    """
 
     SCHEMA: ClassVar[str]
     OLDER: ClassVar[tuple[str, ...]] = ()

@@ -183,7 +183,7 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
 
 @dataclass(frozen=True)
 class Held:
-    """An array in a file: its type and shape, how to read it, and what the file says about it."""
+    """An array in a file: its type and shape, a function that reads it, and what the file says about it."""
 
     dtype: np.dtype
     shape: Shape

@@ -32,8 +32,8 @@ def read_layout(
     Args:
         path: the file.
         grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
-        levels: number of levels. A picture with larger values is taken as one whose white is the highest
-            level, if all its values are whole steps.
+        levels: number of levels. In a picture with larger values, white is taken as the highest level if all
+            values are whole steps.
         average_px: for a picture in two greys: each square of this many pixels a side becomes one pixel of
             the layout, whose level is the number of lighter pixels in the square; a remainder at right and
             bottom is cut off.

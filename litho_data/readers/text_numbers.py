@@ -188,5 +188,5 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    # Only Python takes 1_000 for a number.
+    # Only Python reads 1_000 as a number.
     return "_" not in cell

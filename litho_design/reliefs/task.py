@@ -108,8 +108,12 @@ class ReliefTask(Task):
         error.
         """
         rms_um = self.loss(seen)
-        own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
+        own_um = own_error_um(printer.card, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
+
+    def over_models(self, losses: Tensor) -> Tensor:
+        """Return the expected rms error, µm, if all models are equally likely to be right."""
+        return losses.square().mean().sqrt()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
         """Return the errors of the print, nm."""
@@ -134,7 +138,7 @@ class ReliefTask(Task):
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
-        return min((*starts, self.cells.average(self._best_affine)), key=self._worst_loss)
+        return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
         """Return the layout with the wanted heights unchanged, and the best affine layout."""
@@ -148,8 +152,8 @@ class ReliefTask(Task):
 
     @property
     def _nominal(self) -> Tensor:
-        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted
-        to 0.
+        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted to
+        0.
         """
         return self._affine(
             1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
@@ -157,15 +161,15 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels (size, size) of the gain * height + zero whose worst error over the printers is
-        lowest.
+        """Return the levels (size, size) of the gain * height + zero with the lowest loss over the
+        printers.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
         unit = top * layout.level_height_um / (heights[-1] - heights[0])
 
         def error(given: Sequence[float]) -> float:
-            return self._worst_loss(self.cells.average(self._affine(*given)))
+            return self._expected(self.cells.average(self._affine(*given)))
 
         coarse = [(g * unit, zero * (top - g * unit * span)) for g in _AFFINE_GAINS for zero in _AFFINE_ZEROS]
         gain, zero = min(coarse, key=error)
@@ -182,10 +186,11 @@ class ReliefTask(Task):
         return self.cells(self.cells.average(level).round().clamp(0, layout.levels - 1))
 
     @torch.no_grad()
-    def _worst_loss(self, levels: Tensor) -> float:
-        """Return the largest loss of real levels (*cells), rounded, over the printers of the search."""
+    def _expected(self, levels: Tensor) -> float:
+        """Return the loss of real levels (*cells), rounded, over the printers of the search."""
         whole = self.cells(levels.round())[None, None].float()
-        return max(float(self.loss_by(printer, printer(whole)[0, 0])[0]) for printer in self.printers)
+        losses = torch.stack([self.loss_by(one, one(whole)[0, 0])[0] for one in self.printers])
+        return float(self.over_models(losses))
 
     def thick_score(self, height_um: Tensor) -> None:
         """Return None, because heights do not depend on the light."""

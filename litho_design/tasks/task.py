@@ -154,6 +154,10 @@ class Task:
         phase = printed_phase(nominal, self.settings.optics).to(self.printer.device)
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
+    def over_models(self, losses: Tensor) -> Tensor:
+        """Combine the losses through several models (models,) to one: return the largest."""
+        return losses.max()
+
     def check_printer(self, printer: Printer) -> None:
         """Refuse a printer that cannot print this task's layouts."""
 
@@ -274,8 +278,8 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models the loss is their worst loss plus their disagreement; with samples of the process
-        window it is the risk over the samples. The penalty on rare levels and steps is added.
+        With several models the loss is ``over_models`` plus the models' disagreement; with samples of the
+        process window it is the risk over the samples. The penalty on rare levels and steps is added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
@@ -285,8 +289,7 @@ class Task:
             seen = [bench(height) for height in drawn]
             found = [self.loss_by(one, image) for one, image in zip(self.printers, seen, strict=True)]
             parts = parts or found[0][1]
-            of_models = torch.stack([loss for loss, _ in found])
-            losses.append(of_models.max())
+            losses.append(self.over_models(torch.stack([loss for loss, _ in found])))
         loss = losses[0]
         if len(losses) > 1:
             together = torch.stack(losses)

@@ -116,7 +116,8 @@ def benchmark(
         ]
         done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
         started = time.monotonic()
-        # Models differ too much for a common estimate, so each gives its own, unless the work runs elsewhere.
+        # Models differ too much for a common estimate of the time, so each model has its own, unless the work
+        # runs elsewhere.
         of = len(jobs) if places.elsewhere else 0
         for (name, fold, *_), (record, heights) in progress(
             done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of, at_once=workers
