@@ -59,7 +59,8 @@ def close_loop(
 
     Args:
         store: made by ``litho-data build``.
-        base: name of a model, a frozen one (its folder, ``zoo:NAME``), or ``auto``: small models compete.
+        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which lets small
+            models compete.
         base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds; each scan is predicted by fits without its fold.
         nested: also repeat all choices without each fold, or each print, and judge them on it.
