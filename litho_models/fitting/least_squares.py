@@ -91,8 +91,8 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` wraps the range of the
-    steps.
+    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` may wrap the
+    range of the steps to show progress.
     """
     vector, linear = start, problem.linearise(start)
     if not len(start):

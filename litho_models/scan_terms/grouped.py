@@ -49,8 +49,8 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
 
     Groups come from the card (print, field, tip, direction and turn of a scan) and from each varying
     character of the ids. With ``by_order`` they also come from the order: before and after every possible
-    time of a change. A grouping needs at least two labels, and at least half of them with two or more scans.
-    Of two identical groupings only the first is used.
+    time of a change. A grouping needs at least two labels, and at least half of the labels must have two or
+    more scans. Of two identical groupings only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
