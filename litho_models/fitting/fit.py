@@ -41,44 +41,29 @@ class Fitted:
     seconds: float
 
 
-def fit(model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig) -> Simulator:
-    """Fit a model to scans and return it, in eval mode.
+def fit(
+    model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, checkpoint: Path | None = None
+) -> Fitted:
+    """Fit a model to scans; the model is in eval mode.
 
     Args:
         model_name: one of ``litho_models.models.MODELS``.
         scans: scans to learn from, all of one pitch, level height and number of levels.
-        config: recipe, variant, seed, nuisances.
+        config: recipe, variant, seed, nuisances, settings of the model.
+        checkpoint: folder from which a killed run continues.
 
     Raises:
-        InputError: unknown model, no scans, or scans that do not belong together.
-    """
-    return fit_with_record(model_name, scans, config).model
-
-
-def fit_with_record(
-    model_name: str,
-    scans: Sequence[PrintedScan],
-    config: TrainingConfig,
-    *,
-    checkpoint: Path | None = None,
-    model_fields: dict[str, Any] | None = None,
-) -> Fitted:
-    """As ``fit``, with the history; ``checkpoint`` is a folder from which a killed run continues.
-
-    ``model_fields`` override hyper-parameters of the model's variant.
-
-    Raises:
-        InputError: as ``fit``, or a folder that holds another run's checkpoint or a damaged one.
+        InputError: unknown model, no scans, scans that do not belong together, or a folder that holds another
+            run's checkpoint or a damaged one.
     """
     geometry = common_geometry(scans)
     started = time.monotonic()
     torch.manual_seed(config.seed)
-    fields = {**config.model, **(model_fields or {})}
-    for name in geometry.keys() & fields.keys():
+    for name in geometry.keys() & config.model.keys():
         raise InputError(
-            f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
+            f"setting {name}", got=config.model[name], wanted=f"{geometry[name]}, as the scans have it"
         )
-    model = build_model(model_name, config.variant, **geometry, **fields)
+    model = build_model(model_name, config.variant, **geometry, **config.model)
     # Checked even if the model writes no checkpoint, because the folder may contain another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
@@ -112,13 +97,13 @@ def fit_with_record(
 def fit_in_cache(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
 ) -> Fitted:
-    """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
+    """As ``fit``, continued from (and kept in) a folder of ``cache`` named after its key.
 
     A benchmark and a loop that train the same model on the same scans reuse each other's fits there.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
-    return fit_with_record(model_name, scans, config, checkpoint=cache / f"{name}.checkpoint")
+    return fit(model_name, scans, config, cache / f"{name}.checkpoint")
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:

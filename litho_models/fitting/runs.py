@@ -17,7 +17,7 @@ from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_data.store.schema import DatasetId
-from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
 from litho_models.fitting.processes import joined
@@ -91,7 +91,7 @@ def train(
     with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
         if first:
             say(f"training {model} on {len(used)} scans")
-        fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
+        fitted = fit(model, used, config, folder / CHECKPOINT_FOLDER)
         record = TrainingRun(
             run=run_info([config.seed], len(used)),
             parameters=fitted.model.parameter_count,

@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
 from litho_models.cli.app import app
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.checkpoint import CheckpointFolder
 from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import ModelCard
@@ -74,9 +74,9 @@ def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
     scans, config = make_scans(4, size_px=64), TrainingConfig(**QUICK)
     monkeypatch.setattr(CheckpointFolder, "save", save_and_die)
     with pytest.raises(Killed):
-        fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+        fit("pbl", scans, config, checkpoint=tmp_path / "run")
     monkeypatch.undo()
-    resumed = fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+    resumed = fit("pbl", scans, config, checkpoint=tmp_path / "run")
     assert [entry.step for entry in resumed.history] == [1, 2]
     assert resumed.seconds == 1000.0 + resumed.history[1].seconds
 
