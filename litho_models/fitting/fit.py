@@ -81,9 +81,9 @@ def fit(
             model.take(by_steps)
             history.append(fit_feature_networks(model, training, validation, config))
     elif isinstance(model, Features):
-        fit_ridge(model, scans, config.nuisance, config.free_gain)
+        fit_ridge(model, scans, config.nuisance)
     else:
-        fit_small_model(model, scans, config.nuisance, config.free_gain)
+        fit_small_model(model, scans, config.nuisance)
     return Fitted(
         model=model.eval(),
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
@@ -110,7 +110,7 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
     """Heights of a small model fitted to the scans, from which a network's first scan terms come."""
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
-        fit_small_model(small, scans, config.nuisance, config.free_gain)
+        fit_small_model(small, scans, config.nuisance)
     return [predict_scan(small, scan) for scan in scans]
 
 

@@ -47,7 +47,7 @@ def fit_feature_networks(
         scans do not influence the fit.
     """
     started = time.monotonic()
-    terms = smooth_training_terms(config.nuisance, config.free_gain)
+    terms = smooth_training_terms(config.nuisance)
     count = FITTED_PX // len(scans)
     parts = [_pixels(model, scan, terms, count) for scan in progress(scans, "features of pixels")]
     sizes = [network.feature_count for network in model.feature_networks]

@@ -29,14 +29,14 @@ PASSES = 2
 _TERM_WEIGHT = 1e-3
 
 
-def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False) -> None:
+def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
     """Fit the weights of ``model`` in place to the mean absolute error.
 
     Args:
         model: the model; ``scans``: training scans.
         policy: free terms of each scan, without line offsets, which average out.
     """
-    terms = smooth_training_terms(policy, free_gain)
+    terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):
         _standardise(model, scans)
     solved: FloatMap | None = None

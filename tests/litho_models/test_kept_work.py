@@ -173,7 +173,7 @@ def test_a_damaged_fit_is_told_where_the_noise_reads_it_too(scored, store, tmp_p
 
 def test_a_result_lists_the_settings_that_a_fit_used(scored):
     settings = json.loads((scored[1] / "benchmark.json").read_text())["training"]
-    affine = {"recipe": "fast", "variant": "paper", "seed": 0, "nuisance": "offset", "free_gain": False}
+    affine = {"recipe": "fast", "variant": "paper", "seed": 0, "nuisance": "offset"}
     assert settings["affine"] == {**affine, "model": {}, "optimiser": "gauss-newton"}
     assert {**settings["pbl"], **QUICK} == TrainingConfig(**QUICK).model_dump(mode="json")
 
