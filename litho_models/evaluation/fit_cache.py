@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.files import atomic_folder
@@ -29,16 +29,14 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-class FitDiagnostics(Record):
+# Older results also say what a prediction cost, and how it changes in another crop.
+class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training scans and on held-out scans.
 
     All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
     that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
     ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
     """
-
-    # Older results also say what a prediction cost, and how it changes in another crop.
-    model_config = ConfigDict(extra="ignore")
 
     background: Background
     measurement: MeasurementModel | None = None

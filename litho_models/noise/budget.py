@@ -7,7 +7,6 @@ roughness where the layout is flat and model errors are small.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
@@ -36,15 +35,13 @@ class FlatLevel(Record):
     mae_nm: float
 
 
-class NoiseBudget(Record):
+# Older results also have the length of correlation.
+class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
     ``flat_texture`` is the texture of the same pixels after policy ``full``, so with line offsets.
     """
-
-    # Older results also have the length of correlation.
-    model_config = ConfigDict(extra="ignore")
 
     model: str
     floor: NoiseFloor

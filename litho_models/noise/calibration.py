@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -37,17 +37,14 @@ _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
+
+
 # Older results have further figures: of ensembles, and promises for whole scans.
-_OLDER = ConfigDict(extra="ignore")
-
-
-class ScanCalibration(Record):
+class ScanCalibration(Record, extra="ignore"):
     """One scan: likelihood and CRPS (lower is better), coverage at the levels stated, rms of r/σ.
 
     ``ence`` and ``ause`` are shares, 0 is best (see ``spread_scores``).
     """
-
-    model_config = _OLDER
 
     scan: str
     nll: float
@@ -58,7 +55,7 @@ class ScanCalibration(Record):
     ause: float
 
 
-class Calibration(Record):
+class Calibration(Record, extra="ignore"):
     """A description of the spread, and its calibration on prints outside its fit.
 
     Args:
@@ -66,8 +63,6 @@ class Calibration(Record):
         nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
         pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
     """
-
-    model_config = _OLDER
 
     name: str
     levels: list[float]
@@ -81,13 +76,11 @@ class Calibration(Record):
     ause: float
 
 
-class SigmaBin(Record):
+class SigmaBin(Record, extra="ignore"):
     """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
 
     Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group.
     """
-
-    model_config = _OLDER
 
     covariate: str
     low: float
@@ -103,14 +96,12 @@ class SigmaBin(Record):
     ause: float
 
 
-class SpreadAnalysis(Record):
+class SpreadAnalysis(Record, extra="ignore"):
     """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all scans.
 
     ``nuisance``: what the residuals were freed of. ``left_out``: the prints or scans that are left out of
     each fit to judge it.
     """
-
-    model_config = _OLDER
 
     model: str
     held_out: bool

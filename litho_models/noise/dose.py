@@ -7,7 +7,6 @@ with a dose, of step ladders or any layout with areas of one level wider than th
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
@@ -34,7 +33,7 @@ class LevelHeight(Record):
     pixels: int
 
 
-class DoseRow(Record):
+class DoseRow(Record, extra="ignore"):
     """One dose.
 
     Args:
@@ -47,8 +46,6 @@ class DoseRow(Record):
             more reacts). Relative to the dose's own steps, so that shrinkage does not count as exposure.
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     dose: float
     scans: list[str]

@@ -3,7 +3,6 @@
 from typing import ClassVar
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
@@ -16,10 +15,8 @@ from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 from litho_models.scoring.statistics import rms
 
 
-class NoiseAnalysis(Result):
+class NoiseAnalysis(Result, extra="ignore"):
     """``noise.json``."""
-
-    model_config = ConfigDict(extra="ignore")
 
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = "noise.json"

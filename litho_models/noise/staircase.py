@@ -3,7 +3,6 @@
 from itertools import pairwise
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -23,15 +22,13 @@ _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
 
-class Step(Record):
+class Step(Record, extra="ignore"):
     """One step of a staircase, nm.
 
     Args:
         readability: height over the σ of single pixels on its two treads.
         misread: share of the pixels of both treads nearer to the other one.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     height_nm: float
     uncertainty_nm: float
@@ -40,7 +37,7 @@ class Step(Record):
     misread: float
 
 
-class StepPrint(Record):
+class StepPrint(Record, extra="ignore"):
     """A print of steps.
 
     Args:
@@ -48,8 +45,6 @@ class StepPrint(Record):
         tread_mae_nm: mean absolute deviation from the median of each tread.
         resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     id: str
     axis: Axis

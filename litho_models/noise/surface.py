@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
@@ -15,7 +14,7 @@ Background = Literal["offset", "quadratic"]
 BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
 
 
-class SurfaceNoise(Record):
+class SurfaceNoise(Record, extra="ignore"):
     """Deviation of a surface from its background.
 
     Args:
@@ -26,8 +25,6 @@ class SurfaceNoise(Record):
         independent_heights: pixels over the sum of squared autocorrelation.
     """
 
-    model_config = ConfigDict(extra="ignore")
-
     id: str
     background: Background
     sigma_nm: float
@@ -37,13 +34,11 @@ class SurfaceNoise(Record):
     pixels: int
 
 
-class PrintNoise(Record):
+class PrintNoise(Record, extra="ignore"):
     """Roughness of the print alone: ``print² = flat² − substrate²``, nm.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     background: Background
     print_nm: float | None

@@ -6,7 +6,6 @@ The paper calls the roughness of its flat print line-shaped and not periodic (ar
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
@@ -15,7 +14,7 @@ from litho_data.roughness import line_direction, line_period
 RARE = 1e-3
 
 
-class Period(Record):
+class Period(Record, extra="ignore"):
     """A period of lines.
 
     Args:
@@ -25,8 +24,6 @@ class Period(Record):
         amplitude_nm: root mean square over the surfaces.
         coherence: 1 if the surfaces have one phase, in the frame that they are given in.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     period_um: float
     share: float

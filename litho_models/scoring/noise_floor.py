@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
@@ -70,10 +70,8 @@ UNKNOWN_FLOOR = NoiseFloor(
 )
 
 
-class _StatedFloor(Result):
+class _StatedFloor(Result, extra="ignore"):
     """The parts of a noise analysis that this module reads: its dataset and the floor."""
-
-    model_config = ConfigDict(extra="ignore")
 
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = NOISE_FILE
