@@ -87,7 +87,7 @@ def train_network(
         state.record(record)
         if checkpoints is not None and joined()[0] == 0:
             checkpoints.save(state)
-    state.restore_best()
+    model.load_state_dict(state.best)
     return state.history
 
 

@@ -44,20 +44,17 @@ class ScanAxisConfig(FeatureNetworkConfig):
     shifts_um: Widths = (0.1, 0.2, 0.4, 0.8, 1.6)
 
 
-class FeatureNetwork(OfField, nn.Module):
+class FeatureNetwork(OfField):
     """A function of the features of each pixel, µm: a linear part plus a network; zero at the start."""
 
     # Whether the network may add a constant height.
     has_constant: ClassVar[bool] = True
-    centre: Tensor
-    scale: Tensor
 
     def __init__(self, config: FeatureNetworkConfig, pitch_um: float, full_height_um: float):
         super().__init__()
         self.config, self.pitch_um, self.full_height_um = config, pitch_um, full_height_um
         count = self.feature_count = len(self.features(self._point()))
-        self.register_buffer("centre", torch.zeros(count))
-        self.register_buffer("scale", torch.ones(count))
+        self._register_inputs(count)
         self.linear = nn.Linear(count, 1, bias=self.has_constant)
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise((count, *config.hidden)):
@@ -101,11 +98,6 @@ class FeatureNetwork(OfField, nn.Module):
         for layer in later:
             hidden = _across(layer, hidden) if isinstance(layer, nn.Linear) else layer(hidden)
         return (total + hidden)[0]
-
-    def standardise(self, centre: Tensor, scale: Tensor) -> None:
-        """Set the mean and standard deviation (features,) of the network's inputs."""
-        self.centre.copy_(centre)
-        self.scale.copy_(scale)
 
     def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
         """Local means around each pixel of a field with a margin."""
