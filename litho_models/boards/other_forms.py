@@ -16,6 +16,7 @@ import scipy.ndimage
 import scipy.signal
 import scipy.special
 
+from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab import Cause, Job, Printer
 from litho_data.virtual_fab.canvas import Canvas, apply_transfer, blur, frequencies_per_um
 from litho_data.virtual_fab.geometry import ScanFrame
@@ -23,7 +24,7 @@ from litho_data.virtual_fab.geometry import ScanFrame
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
 # Maps (field, strength, canvas or frame of the scan, job) to the changed field.
-Law = Callable[..., np.ndarray]
+Law = Callable[..., Array]
 Draw = Callable[[np.random.Generator], Law]
 
 # The spot of the fab: sd of the squared intensity, µm.
@@ -65,16 +66,16 @@ class FormCause(Cause):
             if strength
         ]
 
-    def on_dose(self, dose: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
         return np.maximum(self._at("dose", dose, canvas, job), 0.0)
 
-    def on_surface(self, surface_um: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
         return self._at("surface", surface_um, canvas, job)
 
-    def on_scan(self, height_um: np.ndarray, frame: ScanFrame, job: Job) -> np.ndarray:
+    def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
         return self._at("scan", height_um, frame, job)
 
-    def _at(self, stage: Stage, field: np.ndarray, place: Canvas | ScanFrame, job: Job) -> np.ndarray:
+    def _at(self, stage: Stage, field: Array, place: Canvas | ScanFrame, job: Job) -> Array:
         for own, strength, law in self._laws:
             if own == stage:
                 field = law(field, strength, place, job)
@@ -106,7 +107,7 @@ def _far_copy(rng: np.random.Generator) -> Law:
     """Relative dose of a copy displaced by 6–15 µm in a random direction."""
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = distance_um / canvas.pitch_um * np.array([np.sin(direction), np.cos(direction)])
         # The copy may lie beyond the frame, where the outermost levels continue.
         rows, columns = (
@@ -122,10 +123,10 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
     """Relative gain at one period (2–5 µm) along one direction, ringing over 2–5 µm."""
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         along = _frequency_along(canvas, direction)
 
-        def peak(at: np.ndarray | float) -> np.ndarray:
+        def peak(at: Array | float) -> Array:
             return 1 / (1 + (2 * np.pi * decay_um * np.asarray(at)) ** 2)
 
         ringing = peak(along - 1 / period_um) + peak(along + 1 / period_um) - 2 * peak(1 / period_um)
@@ -148,7 +149,7 @@ def _halo_ring(rng: np.random.Generator) -> Law:
     """Dose on a ring of 4–9 µm radius, relative to the focused dose."""
     radius_um = rng.uniform(4, 9)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         frequency = np.hypot(*frequencies_per_um(dose.shape, canvas.pitch_um))
         return _spread(dose, strength, scipy.special.j0(2 * np.pi * radius_um * frequency))
 
@@ -160,7 +161,7 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
     """Share of the dose lost after earlier writing in the hatch line; fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         keeps = np.exp(-canvas.pitch_um / decay_um)
         return dose - strength * scipy.signal.lfilter([0.0, 1 - keeps], [1.0, -keeps], dose, axis=1)
 
@@ -181,7 +182,7 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
     """Slices too many or too few in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         wrong = (canvas.level % 2 == odd) & (canvas.level > 0)
         return dose + sign * strength / 12 * blur(wrong.astype(float), canvas.pitch_um, _SPOT_UM)
 
@@ -259,7 +260,7 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
     """Share of a surface blurred by 0.5–1 µm, growing with the height."""
     reach_um = rng.uniform(0.5, 1)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         blurred = blur(surface, canvas.pitch_um, reach_um)
         return surface + np.clip(strength * blurred, 0.0, 1.0) * (blurred - surface)
 
@@ -274,7 +275,7 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
     """Share of a surface blurred by 0.7–1.2 µm at one side of the field, 0 at the other."""
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         across = _across(canvas, axis=side // 2)
         weight = np.clip(across if side % 2 else 1 - across, 0.0, 1.0)
         return surface + strength * weight * (blur(surface, canvas.pitch_um, reach_um) - surface)
@@ -301,7 +302,7 @@ def _seam_in_place(rng: np.random.Generator) -> Law:
     """Displacement of one side of a seam along the seam."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = np.zeros(2)
         shift[1 - side // 2] = strength / canvas.pitch_um
         moved = scipy.ndimage.shift(surface, shift, order=3, mode="nearest")
@@ -315,7 +316,7 @@ def _rim(rng: np.random.Generator) -> Law:
     """Relative gain of the height at the layout's edge, fading over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         (size_y, size_x), y, x = canvas.size_um, canvas.y_um, canvas.x_um
         inwards = np.minimum(np.minimum(y, size_y - y), np.minimum(x, size_x - x))
         return surface * (1 + strength * np.exp(-np.maximum(inwards, 0.0) / reach_um))
@@ -331,7 +332,7 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
     """Amplitude of line offsets of period 6–20 lines; each scan has a new phase."""
     period, phases = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, _MOST_SCANS)
 
-    def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
+    def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
         line = np.arange(frame.shape[0])[:, None]
         return height + 1e-3 * strength * np.sin(2 * np.pi * line / period + phases[job.index % _MOST_SCANS])
 
@@ -354,7 +355,7 @@ def _s_shaped_axis(rng: np.random.Generator) -> Law:
     """Displacement along x, quadratic and cubic in x with random shares."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
-    def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
+    def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
         x = frame.unit_axes[1]
         moved_um = np.cos(share) * (1.5 * x**2 - 0.5) + np.sin(share) * (2.5 * x**3 - 1.5 * x)
         rows, columns = np.indices(height.shape, dtype=float)
@@ -383,7 +384,7 @@ def _hill_response(rng: np.random.Generator) -> Law:
     """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) beside the logistic one."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         # Doses at which the default printer's logistic gives the Hill curve's conversion at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
@@ -404,28 +405,28 @@ def _elliptical_blur(rng: np.random.Generator) -> Law:
     )
 
 
-def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:
+def _spread(dose: Array, strength: float, transfer: Array) -> Array:
     """Mix the dose with the dose spread by a transfer function (1 at f = 0), with weight ``strength``."""
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
-def _frequency_along(canvas: Canvas, direction: float) -> np.ndarray:
+def _frequency_along(canvas: Canvas, direction: float) -> Array:
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
     return frequency_x * np.cos(direction) + frequency_y * np.sin(direction)
 
 
-def _slope_along(surface: np.ndarray, canvas: Canvas, direction: float) -> np.ndarray:
+def _slope_along(surface: Array, canvas: Canvas, direction: float) -> Array:
     slope_y, slope_x = np.gradient(surface, canvas.pitch_um)
     return slope_x * np.cos(direction) + slope_y * np.sin(direction)
 
 
-def _across(canvas: Canvas, axis: int) -> np.ndarray:
+def _across(canvas: Canvas, axis: int) -> Array:
     """Position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the last."""
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
-def _beyond(canvas: Canvas, side: int, place: float) -> np.ndarray:
+def _beyond(canvas: Canvas, side: int, place: float) -> Array:
     """True on one side of a seam; ``side`` gives the axis that it crosses, and the side."""
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

@@ -165,7 +165,8 @@ class Answer(Result):
     corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
-class Trial(Result):
+# Older results also have the loop's verdict and its base.
+class Trial(Result, extra="ignore"):
     """The result of one trial; a failed one has a reason and no errors.
 
     Attributes:
@@ -183,8 +184,6 @@ class Trial(Result):
     outcomes: list[Outcome]
     false_names: list[str] = Field(default_factory=list)
     found: list[Found] = Field(default_factory=list)
-    verdict: str = ""
-    base_model: str = ""
     errors: TrialErrors | None = None
     bias: tuple[float, float] | None = None
     dataset_cpu_s: float | None = None
@@ -192,7 +191,10 @@ class Trial(Result):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard."""
+    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard.
+
+    ``loop``: name of the judged loop; ``draws_sha256``: hash of ``draws.json``, of a judged board.
+    """
 
     SCHEMA: ClassVar[str] = "litho-models/blind-trials/3"
     FILE_NAME: ClassVar[str] = "scoreboard.json"
@@ -202,5 +204,7 @@ class Scoreboard(Result):
     versions: dict[str, str]
     board: Board
     seed: int
+    loop: str = ""
+    draws_sha256: str = ""
     pending: list[int]
     trials: list[Trial]
