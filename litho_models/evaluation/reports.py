@@ -50,10 +50,10 @@ def write_evaluation_report(
 def write_benchmark_report(
     result: Benchmark,
     scans: Sequence[PrintedScan],
-    predictions_um: Mapping[str, Mapping[str, np.ndarray]],
+    predictions_um: Mapping[str, Sequence[np.ndarray]],
     out: str | Path,
 ) -> Path:
-    """Render the result into ``out``; ``predictions_um`` is model name -> scan id -> height."""
+    """Render the result into ``out``; ``predictions_um``: what each model expects of each scan."""
     scores, split = sorted(result.scores, key=lambda s: -s.leading_nm), result.split
     best = scores[-1]
     page = _page(f"Benchmark on {result.dataset.name}", result, {})
@@ -80,9 +80,9 @@ def write_benchmark_report(
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )
-    middle = scans[int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])]
-    shown = {s.model: predictions_um[s.model][middle.id] for s in scores}
-    _one_scan(page, "The scan of median error", middle, shown, result.nuisance)
+    middle = int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])
+    shown = {s.model: predictions_um[s.model][middle] for s in scores}
+    _one_scan(page, "The scan of median error", scans[middle], shown, result.nuisance)
     page.heading("Training", folded=True)
     page.table(
         result.fits,
