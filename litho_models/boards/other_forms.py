@@ -21,11 +21,12 @@ from litho_data.virtual_fab import Cause, Job, Printer
 from litho_data.virtual_fab.canvas import Canvas, apply_transfer, blur, frequencies_per_um
 from litho_data.virtual_fab.geometry import ScanFrame
 
+Rng = np.random.Generator
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
 # Maps (field, strength, canvas or frame of the scan, job) to the changed field.
 Law = Callable[..., Array]
-Draw = Callable[[np.random.Generator], Law]
+Draw = Callable[[Rng], Law]
 
 # The spot of the fab: sd of the squared intensity, µm.
 _SPOT_UM = 0.2
@@ -103,7 +104,7 @@ def _form(
 
 
 @_form("far-copy", "dose", "1", 0.6)
-def _far_copy(rng: np.random.Generator) -> Law:
+def _far_copy(rng: Rng) -> Law:
     """Relative dose of a copy displaced by 6–15 µm in a random direction."""
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
@@ -119,7 +120,7 @@ def _far_copy(rng: np.random.Generator) -> Law:
 
 
 @_form("oriented-ringing", "dose", "1", 2.0)
-def _oriented_ringing(rng: np.random.Generator) -> Law:
+def _oriented_ringing(rng: Rng) -> Law:
     """Relative gain at one period (2–5 µm) along one direction, ringing over 2–5 µm."""
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
@@ -136,7 +137,7 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
 
 
 @_form("oriented-proximity", "dose", "1", 1.0)
-def _oriented_proximity(rng: np.random.Generator) -> Law:
+def _oriented_proximity(rng: Rng) -> Law:
     """Dose spread over 4–8 µm along one direction, relative to the focused dose."""
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: _spread(
@@ -145,7 +146,7 @@ def _oriented_proximity(rng: np.random.Generator) -> Law:
 
 
 @_form("halo-ring", "dose", "1", 1.0)
-def _halo_ring(rng: np.random.Generator) -> Law:
+def _halo_ring(rng: Rng) -> Law:
     """Dose on a ring of 4–9 µm radius, relative to the focused dose."""
     radius_um = rng.uniform(4, 9)
 
@@ -157,7 +158,7 @@ def _halo_ring(rng: np.random.Generator) -> Law:
 
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
-def _fast_axis_memory(rng: np.random.Generator) -> Law:
+def _fast_axis_memory(rng: Rng) -> Law:
     """Share of the dose lost after earlier writing in the hatch line; fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
@@ -169,7 +170,7 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
 
 
 @_form("crowding", "dose", "1", 4.0)
-def _crowding(rng: np.random.Generator) -> Law:
+def _crowding(rng: Rng) -> Law:
     """Relative gain of the dose with the cube of the density over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
@@ -178,7 +179,7 @@ def _crowding(rng: np.random.Generator) -> Law:
 
 
 @_form("alternate-slices", "dose", "1", 2.0)
-def _alternate_slices(rng: np.random.Generator) -> Law:
+def _alternate_slices(rng: Rng) -> Law:
     """Slices too many or too few in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
@@ -190,7 +191,7 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
 
 
 @_form("focus-step", "dose", "µm", 2.0)
-def _focus_step(rng: np.random.Generator) -> Law:
+def _focus_step(rng: Rng) -> Law:
     """Sd added to the spot from a random print near the middle on."""
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
@@ -202,7 +203,7 @@ def _focus_step(rng: np.random.Generator) -> Law:
 
 
 @_form("cubic-slope-loss", "surface", "µm", 8.0, names=("slope-thinning",))
-def _cubic_slope_loss(rng: np.random.Generator) -> Law:
+def _cubic_slope_loss(rng: Rng) -> Law:
     """Height lost per cubed slope in any direction."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.hypot(*np.gradient(surface, canvas.pitch_um)) ** 3
@@ -210,7 +211,7 @@ def _cubic_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("diagonal-slope-loss", "surface", "µm", 4.0, names=("slope-thinning",))
-def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
+def _diagonal_slope_loss(rng: Rng) -> Law:
     """Height lost per squared slope along one direction, 30–60° from the axes."""
     direction = rng.uniform(np.pi / 6, np.pi / 3) + rng.integers(2) * np.pi / 2
     return lambda surface, strength, canvas, job: (
@@ -219,7 +220,7 @@ def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
-def _lee_side_loss(rng: np.random.Generator) -> Law:
+def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall in one direction."""
     # This is half a loss on both flanks and half a displacement, which registration removes.
     direction = rng.uniform(0, 2 * np.pi)
@@ -229,7 +230,7 @@ def _lee_side_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("plateau", "surface", "1", 1.0)
-def _plateau(rng: np.random.Generator) -> Law:
+def _plateau(rng: Rng) -> Law:
     """Share of the height lost between two heights 0.15–0.25 µm apart; 1: a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
@@ -238,7 +239,7 @@ def _plateau(rng: np.random.Generator) -> Law:
 
 
 @_form("fringes", "surface", "nm", 150.0)
-def _fringes(rng: np.random.Generator) -> Law:
+def _fringes(rng: Rng) -> Law:
     """Amplitude of an error periodic in the height, with period 0.12–0.3 µm."""
     period_um, phase = rng.uniform(0.12, 0.3), rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
@@ -247,7 +248,7 @@ def _fringes(rng: np.random.Generator) -> Law:
 
 
 @_form("overshoot", "surface", "1", 2.0)
-def _overshoot(rng: np.random.Generator) -> Law:
+def _overshoot(rng: Rng) -> Law:
     """Gain of detail finer than 0.6–1.2 µm, so edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
@@ -256,7 +257,7 @@ def _overshoot(rng: np.random.Generator) -> Law:
 
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
-def _blur_with_height(rng: np.random.Generator) -> Law:
+def _blur_with_height(rng: Rng) -> Law:
     """Share of a surface blurred by 0.5–1 µm, growing with the height."""
     reach_um = rng.uniform(0.5, 1)
 
@@ -271,7 +272,7 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
 
 
 @_form("blur-across-field", "surface", "1", 1.0)
-def _blur_across_field(rng: np.random.Generator) -> Law:
+def _blur_across_field(rng: Rng) -> Law:
     """Share of a surface blurred by 0.7–1.2 µm at one side of the field, 0 at the other."""
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
@@ -284,21 +285,21 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
 
 
 @_form("seam-in-gain", "surface", "1", 0.6)
-def _seam_in_gain(rng: np.random.Generator) -> Law:
+def _seam_in_gain(rng: Rng) -> Law:
     """Share of the height lost on one side of a seam through the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
     return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, side, place))
 
 
 @_form("seam-in-height", "surface", "nm", 300.0)
-def _seam_in_height(rng: np.random.Generator) -> Law:
+def _seam_in_height(rng: Rng) -> Law:
     """Step of the height at a seam through the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
     return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, side, place)
 
 
 @_form("seam-in-place", "surface", "µm", 1.5)
-def _seam_in_place(rng: np.random.Generator) -> Law:
+def _seam_in_place(rng: Rng) -> Law:
     """Displacement of one side of a seam along the seam."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
@@ -312,7 +313,7 @@ def _seam_in_place(rng: np.random.Generator) -> Law:
 
 
 @_form("rim", "surface", "1", 1.0)
-def _rim(rng: np.random.Generator) -> Law:
+def _rim(rng: Rng) -> Law:
     """Relative gain of the height at the layout's edge, fading over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
@@ -328,7 +329,7 @@ def _rim(rng: np.random.Generator) -> Law:
 
 
 @_form("periodic-lines", "scan", "nm", 150.0)
-def _periodic_lines(rng: np.random.Generator) -> Law:
+def _periodic_lines(rng: Rng) -> Law:
     """Amplitude of line offsets of period 6–20 lines; each scan has a new phase."""
     period, phases = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, _MOST_SCANS)
 
@@ -343,7 +344,7 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
 
 
 @_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
-def _linear_slope_loss(rng: np.random.Generator) -> Law:
+def _linear_slope_loss(rng: Rng) -> Law:
     """Height lost per absolute slope along the hatch lines."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.abs(_slope_along(surface, canvas, direction=0.0))
@@ -351,7 +352,7 @@ def _linear_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
-def _s_shaped_axis(rng: np.random.Generator) -> Law:
+def _s_shaped_axis(rng: Rng) -> Law:
     """Displacement along x, quadratic and cubic in x with random shares."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
@@ -369,7 +370,7 @@ def _s_shaped_axis(rng: np.random.Generator) -> Law:
 
 
 @_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
-def _two_part_spot(rng: np.random.Generator) -> Law:
+def _two_part_spot(rng: Rng) -> Law:
     """Share of the spot in a second part with sd 0.5–0.9 µm."""
     width_um = rng.uniform(0.5, 0.9)
     return lambda dose, strength, canvas, job: (
@@ -380,7 +381,7 @@ def _two_part_spot(rng: np.random.Generator) -> Law:
 @_form(
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
-def _hill_response(rng: np.random.Generator) -> Law:
+def _hill_response(rng: Rng) -> Law:
     """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) beside the logistic one."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
@@ -397,7 +398,7 @@ def _hill_response(rng: np.random.Generator) -> Law:
 
 
 @_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
-def _elliptical_blur(rng: np.random.Generator) -> Law:
+def _elliptical_blur(rng: Rng) -> Law:
     """Sd added to the spot along one direction."""
     direction = rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: apply_transfer(
