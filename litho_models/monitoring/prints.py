@@ -83,10 +83,7 @@ class Spread(NamedTuple):
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
     """The prints in printing order, by the first scan of each."""
-    first: dict[str, tuple[int, str]] = {}
-    for row in rows:
-        first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
-    return sorted(first, key=first.__getitem__)
+    return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:

@@ -47,7 +47,7 @@ def _sentences(template: str, **values: object) -> list[str]:
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
     """Whether the reference's errors are too small to compare errors on unseen prints with.
 
-    On a fit's own scans an error is too small by the share of parameters in the independent pixels. Neighbours
+    On a fit's own scans an error is too small by the ratio of parameters to independent pixels. Neighbours
     within a correlation length of the residual count once.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
