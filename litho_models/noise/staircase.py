@@ -161,12 +161,9 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
     """Columns of each tread without a guard at its edges, which is at most a third of its width."""
-    limits = [0, *edges_px, shape[1]]
-    treads = []
-    for start, stop in pairwise(limits):
-        inset = min(guard_px, (stop - start) // 3)
-        treads.append(slice(start + inset, stop - inset))
-    return treads
+    ends = pairwise([0, *edges_px, shape[1]])
+    insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]
+    return [slice(start + inset, stop - inset) for start, stop, inset in insets]
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
