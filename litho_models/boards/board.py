@@ -111,8 +111,8 @@ def judge_board(
     source = Path(board)
     draws = Draws.read(source)
     asked = loop or partial(own_loop, base=draws.base, report=report)
-    known = getattr(loop, "__name__", "a loop") if loop else "litho-models close-loop"
-    facts = {"draws_sha256": file_sha256(source / Draws.FILE_NAME), "loop": name or known}
+    usual = getattr(loop, "__name__", "a loop") if loop else "litho-models close-loop"
+    facts = {"draws_sha256": file_sha256(source / Draws.FILE_NAME), "loop": name or usual}
     with growing_folder(out, Scoreboard.FILE_NAME, facts) as begun:
         for draw in progress(draws.trials, "judging"):
             folder = begun.folder / TRIALS / name_of(draw)

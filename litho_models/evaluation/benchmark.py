@@ -151,7 +151,7 @@ def benchmark(
                 score_model(name, boxed, predicted(name, box), protocol) for name in models if boxed
             ],
             paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
-            fits=[record for record, _ in fits.values()],
+            fits=[fits[name, fold.number][0] for name, fold, *_ in jobs],
         )
         write_benchmark_report(result, scored, maps, out)
         result.write(out)

@@ -71,8 +71,8 @@ def evaluate(
         every = dataset.scans()
         kept = locked_by_the_card(frozen, dataset)
         locked = sorted({*dataset.locked_ids, *kept})
-        all_count = open_lock_box or not made_of_these_prints(frozen, dataset)
-        scans = [scan for scan in every if all_count or scan.id not in locked]
+        locked_too = open_lock_box or not made_of_these_prints(frozen, dataset)
+        scans = [scan for scan in every if locked_too or scan.id not in locked]
         if not scans:
             raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
         ids = [scan.id for scan in scans]
