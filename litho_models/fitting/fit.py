@@ -2,15 +2,16 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.printed_scan import scan_sha256
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
@@ -30,15 +31,25 @@ from litho_models.splits.folds import inner_validation
 FIRST_MODEL = "linear"
 
 
-@dataclass(frozen=True)
-class Fitted:
+class FitFacts(Record):
+    """The scans that a model was fitted to and chosen on, its size and cost.
+
+    ``at_bounds`` maps each fitted value on a bound of its range to that bound.
+    """
+
+    parameters: int
+    training_ids: list[str]
+    validation_ids: list[str]
+    seconds: float
+    at_bounds: dict[str, float] = Field(default_factory=dict)
+
+
+class Fitted(NamedTuple):
     """A fitted model and how it was fitted; ``history`` is empty for models without rounds."""
 
     model: Simulator
-    training_ids: list[str]
-    validation_ids: list[str]
+    facts: FitFacts
     history: list[RoundRecord]
-    seconds: float
 
 
 def fit(
@@ -84,14 +95,15 @@ def fit(
         fit_ridge(model, scans, config.nuisance)
     else:
         fit_small_model(model, scans, config.nuisance)
-    return Fitted(
-        model=model.eval(),
+    facts = FitFacts(
+        parameters=model.parameter_count,
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
-        history=history,
         # Includes the time before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
+        at_bounds=model.at_bounds,
     )
+    return Fitted(model.eval(), facts, history)
 
 
 def fit_in_cache(

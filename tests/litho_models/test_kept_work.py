@@ -78,7 +78,7 @@ def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
     monkeypatch.undo()
     resumed = fit("pbl", scans, config, checkpoint=tmp_path / "run")
     assert [entry.step for entry in resumed.history] == [1, 2]
-    assert resumed.seconds == 1000.0 + resumed.history[1].seconds
+    assert resumed.facts.seconds == 1000.0 + resumed.history[1].seconds
 
 
 @pytest.mark.parametrize(

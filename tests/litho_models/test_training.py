@@ -233,8 +233,8 @@ def test_a_checkpoint_of_another_run_is_refused(what, quick_run):
 
 def test_the_checkpoint_is_chosen_on_inner_validation_scans_only():
     fitted = fit("pbl", make_scans(8, size_px=64), TrainingConfig(**QUICK, model=SMALL_NETS))
-    assert len(fitted.validation_ids) == 2
-    assert not set(fitted.validation_ids) & set(fitted.training_ids)
+    assert len(fitted.facts.validation_ids) == 2
+    assert not set(fitted.facts.validation_ids) & set(fitted.facts.training_ids)
     assert all(entry.validation_mae_datum_free_nm is not None for entry in fitted.history)
 
 
