@@ -11,6 +11,7 @@ from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.evaluation.wording import benchmark_verdict, evaluation_verdict, said
 from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.metrics import residual_um
 from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
@@ -119,7 +120,7 @@ def _one_scan(
     predictions_um: Mapping[str, np.ndarray],
     protocol: NuisanceProtocol,
 ) -> None:
-    residuals = {name: plots.residual_um(scan, own, protocol) for name, own in predictions_um.items()}
+    residuals = {name: residual_um(scan, own, protocol) for name, own in predictions_um.items()}
     page.heading(title, folded=True)
     page.figure(plots.residual_maps(scan, residuals), f"{scan.id}: measured height and error.")
     last = dict(list(residuals.items())[-2:])

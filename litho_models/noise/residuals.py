@@ -14,7 +14,8 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
-from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
+from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.metrics import residual_um
 from litho_models.scoring.records import Prediction
 
 
@@ -63,11 +64,7 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
     found = [maps[scan.id] for scan in scans]
-    terms = policy_terms(protocol.policy)
-    residuals = [
-        NM_PER_UM * cross_fit(scan.height_um, own, scan.valid, terms, protocol.blocks).residual_um
-        for scan, own in zip(scans, found, strict=True)
-    ]
+    residuals = [NM_PER_UM * residual_um(scan, own, protocol) for scan, own in zip(scans, found, strict=True)]
     return Residuals(name, scans, found, residuals, held_out, protocol)
 
 
