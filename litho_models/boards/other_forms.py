@@ -287,21 +287,21 @@ def _blur_across_field(rng: Rng) -> Law:
 @_form("seam-in-gain", "surface", "1", 0.6)
 def _seam_in_gain(rng: Rng) -> Law:
     """Share of the height lost on one side of a seam through the field."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-    return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, side, place))
+    seam = _seam(rng)
+    return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, *seam))
 
 
 @_form("seam-in-height", "surface", "nm", 300.0)
 def _seam_in_height(rng: Rng) -> Law:
     """Step of the height at a seam through the field."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-    return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, side, place)
+    seam = _seam(rng)
+    return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, *seam)
 
 
 @_form("seam-in-place", "surface", "µm", 1.5)
 def _seam_in_place(rng: Rng) -> Law:
     """Displacement of one side of a seam along the seam."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
+    side, place = _seam(rng)
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = np.zeros(2)
@@ -425,6 +425,11 @@ def _across(canvas: Canvas, axis: int) -> Array:
     """Position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the last."""
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
+
+
+def _seam(rng: Rng) -> tuple[int, float]:
+    """A side, and the place of a seam through the field, for ``_beyond``."""
+    return int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> Array:

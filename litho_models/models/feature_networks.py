@@ -99,9 +99,17 @@ class FeatureNetwork(OfField):
             hidden = _across(layer, hidden) if isinstance(layer, nn.Linear) else layer(hidden)
         return (total + hidden)[0]
 
-    def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
-        """Local means around each pixel of a field with a margin."""
-        return [blurred_interior(field, width, self.pitch_um, margin_px) for width in self.config.steep_um]
+    @abstractmethod
+    def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
+        """Slope over σ and curvature over σ²; from a height with a margin of 1 px."""
+
+    def _steepness(self, field: Tensor) -> list[Tensor]:
+        """Local means of the size of the slope and of its square around each pixel."""
+        sigma, widths = self.config.slope_blurs_um[0], self.config.steep_um
+        margin = self._radius(*widths)
+        slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
+        sizes = slope.abs(), slope * slope
+        return [blurred_interior(size, width, self.pitch_um, margin) for size in sizes for width in widths]
 
 
 class Surroundings(FeatureNetwork):
@@ -121,13 +129,10 @@ class Surroundings(FeatureNetwork):
             found.append(sum(sides[1:], sides[0]))
             found.append(sum(((side - here).abs() for side in sides), torch.zeros_like(here)))
             found.append((sides[1] - sides[0]).abs() + (sides[3] - sides[2]).abs())
-        margin = self._radius(*config.steep_um)
-        sigma = config.slope_blurs_um[0]
-        length, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
-        return found + self._averaged(length, margin) + self._averaged(length * length, margin)
+        return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Length of the slope over σ and curvature over σ²; from a height with a margin of 1 px."""
+        """Length of the slope."""
         up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
@@ -159,13 +164,10 @@ class ScanAxis(FeatureNetwork):
             _, _, left, right = neighbours(crop_border(field, reach - step), step)
             before, after = left - here, right - here
             found += [before, after, before.abs(), after.abs(), (right - left).abs()]
-        margin = self._radius(*config.steep_um)
-        sigma = config.slope_blurs_um[0]
-        slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
-        return found + self._averaged(slope.abs(), margin) + self._averaged(slope * slope, margin)
+        return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Slope over σ and curvature over σ², both along x; from a height with a margin of 1 px."""
+        """Slope and curvature along x."""
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2

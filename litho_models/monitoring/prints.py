@@ -109,11 +109,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     scans, rest = int(prints.counts.sum()), 0.0
     for name, value in zip(prints.names, prints.values, strict=True):
         rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
-    if scans == n:
-        return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
-    within = rest / (scans - n)
+    within = rest / (scans - n) if scans > n else None
     # The variance of the means of prints is that between prints plus the mean part of the scans.
-    between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
+    between = max(sd**2 - (within or 0.0) * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
 

@@ -1,6 +1,6 @@
 """Test the calibration of a stated spread on prints outside its fit."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -11,11 +11,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.noise.residuals import Residuals
+from litho_models.noise.residuals import Pool, Residuals
 from litho_models.noise.spread_scores import (
     COVERAGE_LEVELS,
     GAUSSIAN,
     Tails,
+    equal_counts,
     normalised_calibration_error,
     sparsification_error,
 )
@@ -29,7 +30,7 @@ from litho_models.noise.variance import (
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scoring.statistics import pixel_interval, rms
+from litho_models.scoring.statistics import rms
 
 _FOLDS = 5
 # Roughness is correlated over ten pixels and more, so more pixels add no information.
@@ -210,17 +211,11 @@ def _bins(
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
     """Bins of all pixels, of each level, and of equal counts of every other covariate."""
-    used = [np.isfinite(residual) for residual in residuals_nm]
-
-    def pooled(maps: Sequence[Array]) -> Array:
-        return np.concatenate([field[use] for field, use in zip(maps, used, strict=True)])
-
-    residual = pooled(residuals_nm)
-    sigma = pooled([own.tails.sd * own.scale_nm for own in stated])
-    owner = np.repeat(np.arange(len(scans)), [int(use.sum()) for use in used])
-    prints = [scan.print_id for scan in scans]
+    pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
+    residual = pool.of(residuals_nm)
+    sigma = pool.of([own.tails.sd * own.scale_nm for own in stated])
     inside = {
-        share: pooled(
+        share: pool.of(
             [
                 own.tails.covered(r, own.scale_nm, share / 100)
                 for r, own in zip(residuals_nm, stated, strict=True)
@@ -228,13 +223,13 @@ def _bins(
         )
         for share in (68, 95)
     }
-    for covariate, low, high, mine in _groups(scans, places, pooled):
+    for covariate, low, high, mine in _groups(pool, places):
         if not residual[mine].any():
             continue
         coverage: dict[str, Any] = {}
         for share, within in inside.items():
             coverage[f"coverage_{share}"] = float(within[mine].mean())
-            coverage[f"coverage_{share}_ci95"] = pixel_interval(within[mine], owner[mine], prints)
+            coverage[f"coverage_{share}_ci95"] = pool.interval(within, mine)
         yield SigmaBin(
             covariate=covariate,
             low=low,
@@ -248,20 +243,14 @@ def _bins(
         )
 
 
-def _groups(
-    scans: Sequence[PrintedScan],
-    places: Sequence[dict[str, Array]],
-    pooled: Callable[[Sequence[Array]], Array],
-) -> Iterator[tuple[str, float, float, Array]]:
+def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[str, float, float, Array]]:
     """What a group of pixels has in common, from and to which value, and which pixels it has."""
-    level = pooled([scan.mask_level for scan in scans])
+    level = pool.of([scan.mask_level for scan in pool.scans])
     yield "all", 0, 0, np.ones(level.size, bool)
     for one in np.unique(level).tolist():
         yield "level", one, one, level == one
     for name in PLACES[1:]:
-        values = pooled([own[name] for own in places])
-        limits = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-        number = np.searchsorted(limits[1:-1], values, side="right")
+        limits, number = equal_counts(pool.of([own[name] for own in places]), _BINS)
         for at, (low, high) in enumerate(pairwise(limits.tolist())):
             yield name, low, high, number == at
 

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
@@ -16,7 +18,8 @@ from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metrics import residual_um
-from litho_models.scoring.records import Prediction
+from litho_models.scoring.records import Interval, Prediction
+from litho_models.scoring.statistics import pixel_interval
 
 
 class Residuals(NamedTuple):
@@ -34,6 +37,22 @@ class Residuals(NamedTuple):
     residuals_nm: Sequence[Array]
     held_out: bool
     protocol: NuisanceProtocol = NuisanceProtocol()
+
+
+class Pool(NamedTuple):
+    """Pixels of several scans, one scan after the other; ``used``: bool maps (ny, nx) of the pixels."""
+
+    scans: Sequence[PrintedScan]
+    used: Sequence[Array]
+
+    def of(self, maps: Sequence[Array]) -> Array:
+        """The values of one map per scan at the pixels, (n,)."""
+        return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
+
+    def interval(self, values: Array, mine: Array) -> Interval:
+        """Interval over prints of the mean of values (n,) at the chosen pixels."""
+        owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
+        return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:

@@ -11,6 +11,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
 from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
+from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
@@ -169,7 +170,7 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
     """Heights without the common tilt of all treads; NaN outside the treads."""
     ny, nx = height_um.shape
-    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    x, y = smooth_shapes((ny, nx))[:2]
     terms = [np.zeros((ny, nx)) for _ in treads]
     inside = np.zeros((ny, nx), bool)
     for term, tread in zip(terms, treads, strict=True):
