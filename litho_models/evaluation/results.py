@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -35,8 +35,8 @@ class ModelRecord(Record):
 class Evaluation(Result):
     """``evaluation.json``."""
 
-    SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
-    FILE_NAME: ClassVar[str] = "evaluation.json"
+    SCHEMA = "litho-models/evaluation/1"
+    FILE_NAME = "evaluation.json"
 
     run: RunInfo
     dataset: DatasetId
@@ -51,8 +51,8 @@ class Evaluation(Result):
 class Benchmark(Result):
     """``benchmark.json``."""
 
-    SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
-    FILE_NAME: ClassVar[str] = "benchmark.json"
+    SCHEMA = "litho-models/benchmark/1"
+    FILE_NAME = "benchmark.json"
 
     run: RunInfo
     dataset: DatasetId

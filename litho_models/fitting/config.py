@@ -1,6 +1,6 @@
 """The settings of a training: a frozen, explicit record that every run saves."""
 
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 from pydantic import ConfigDict, Field
 
@@ -30,7 +30,7 @@ class TrainingConfig(Record):
     which a part is the layout's; their offset is pinned to a mean of zero over the training scans.
     """
 
-    FORMER: ClassVar[frozenset[str]] = frozenset({"free_gain"})
+    FORMER = frozenset({"free_gain"})
     model_config = ConfigDict(allow_inf_nan=False)
 
     recipe: Recipe = "fast"

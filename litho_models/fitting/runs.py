@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -36,8 +36,8 @@ CHECKPOINT_FOLDER = "checkpoint"
 class TrainingRun(FitFacts, Result):
     """``run.json``: the record of a training."""
 
-    SCHEMA: ClassVar[str] = "litho-models/run/1"
-    FILE_NAME: ClassVar[str] = "run.json"
+    SCHEMA = "litho-models/run/1"
+    FILE_NAME = "run.json"
 
     run: RunInfo
     dataset: DatasetId

@@ -1,7 +1,7 @@
 """The card of a frozen model: its use, its origin, and its errors."""
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
@@ -60,11 +60,9 @@ class ModelCard(RunFacts, Result):
 
     model_config = ConfigDict(allow_inf_nan=False)
 
-    FORMER: ClassVar[frozenset[str]] = frozenset(
-        {"declared_processes", "unexplained_fraction", "fabrication_batch", "optimiser_gap"}
-    )
-    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
-    FILE_NAME: ClassVar[str] = CARD_FILE
+    FORMER = frozenset({"declared_processes", "unexplained_fraction", "fabrication_batch", "optimiser_gap"})
+    SCHEMA = "litho-models/frozen/1"
+    FILE_NAME = CARD_FILE
 
     name: PlainName
     model: str

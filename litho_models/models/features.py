@@ -19,7 +19,7 @@ _LEAST_SLOPE = 1e-4
 
 
 class FeaturesConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         *("sigmas_um", "slope_sigmas_um", "shifts_um", "shift_sigma_um"),
         *("streak_sigmas_um", "steep_sigmas_um", "steep_widths_um"),
     )

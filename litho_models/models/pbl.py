@@ -33,7 +33,7 @@ Channels = Annotated[int, Field(ge=1, le=1024)]
 
 
 class PblConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         "sigma_optical_um",
         "sigma_diffusion_max_um",
         "sigma_diffusion_init_um",

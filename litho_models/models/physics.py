@@ -25,7 +25,7 @@ Spot = Literal["given", "round", "elliptical"]
 class PhysicsConfig(SimulatorConfig):
     """Config of Physics; variants replace some defaults."""
 
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         *("sigma_optical_um", "sigma_optical_max_um"),
         *("sigma_diffusion_max_um", "sigma_diffusion_init_um"),
     )

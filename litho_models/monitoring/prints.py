@@ -1,7 +1,7 @@
 """The record ``check.json`` and its figures: one value per print, and their spread between prints."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -168,8 +168,8 @@ class Check(Result):
     ``false_alarm_rate``: chance that such a data set from an unchanged printer raises an alarm.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/check/2"
-    FILE_NAME: ClassVar[str] = "check.json"
+    SCHEMA = "litho-models/check/2"
+    FILE_NAME = "check.json"
 
     run: RunInfo
     dataset: DatasetId

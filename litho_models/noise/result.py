@@ -1,7 +1,5 @@
 """``noise.json``: everything known about the noise of a dataset, and the floor that follows."""
 
-from typing import ClassVar
-
 import numpy as np
 
 from litho_data.foundation.results import Result
@@ -18,8 +16,8 @@ from litho_models.scoring.statistics import rms
 class NoiseAnalysis(Result, extra="ignore"):
     """``noise.json``."""
 
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = "noise.json"
+    SCHEMA = "litho-models/noise/1"
+    FILE_NAME = "noise.json"
 
     run: RunInfo
     dataset: DatasetId | None

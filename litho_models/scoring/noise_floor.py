@@ -6,7 +6,7 @@ residuals of a model, by comparing pixels with similar surroundings (``like_layo
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -73,8 +73,8 @@ UNKNOWN_FLOOR = NoiseFloor(
 class _StatedFloor(Result, extra="ignore"):
     """The parts of a noise analysis that this module reads: its dataset and the floor."""
 
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = NOISE_FILE
+    SCHEMA = "litho-models/noise/1"
+    FILE_NAME = NOISE_FILE
 
     dataset: DatasetId | None
     noise_floor: NoiseFloor
