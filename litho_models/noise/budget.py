@@ -16,7 +16,7 @@ from litho_models.noise.residuals import Pool, Residuals
 from litho_models.noise.texture import Texture, texture
 from litho_models.noise.variance import layout_slope
 from litho_models.scoring.noise_floor import NoiseFloor, floor_of_residuals, freed_by_policy
-from litho_models.scoring.statistics import rms
+from litho_models.scoring.statistics import Interval, rms
 
 FLAT_SHARE = 0.25
 _FEWEST_PIXELS = 1000
@@ -31,7 +31,7 @@ class FlatLevel(Record):
     level: int
     pixels: int
     sigma_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     mae_nm: float
 
 

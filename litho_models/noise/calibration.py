@@ -30,7 +30,7 @@ from litho_models.noise.variance import (
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scoring.statistics import rms
+from litho_models.scoring.statistics import Interval, rms
 
 _FOLDS = 5
 # Roughness is correlated over ten pixels and more, so more pixels add no information.
@@ -90,9 +90,9 @@ class SigmaBin(Record, extra="ignore"):
     rms_nm: float
     predicted_nm: float
     coverage_68: float
-    coverage_68_ci95: tuple[float, float] | None
+    coverage_68_ci95: Interval
     coverage_95: float
-    coverage_95_ci95: tuple[float, float] | None
+    coverage_95_ci95: Interval
     ence: float
     ause: float
 

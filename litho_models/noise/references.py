@@ -21,7 +21,7 @@ from litho_models.noise.surface import (
     without_background,
 )
 from litho_models.noise.texture import Texture, texture
-from litho_models.scoring.statistics import interval, rms
+from litho_models.scoring.statistics import Interval, interval, rms
 
 _SQUARE_WITHIN = 0.01
 # Pixels that two prints of one layout must have in common.
@@ -112,7 +112,7 @@ class RepeatedPrints(Record):
     """
 
     sigma_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     mae_nm: float
     scans: int
 

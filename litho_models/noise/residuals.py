@@ -18,8 +18,8 @@ from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metrics import residual_um
-from litho_models.scoring.records import Interval, Prediction
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.records import Prediction
+from litho_models.scoring.statistics import Interval, pixel_interval
 
 
 class Residuals(NamedTuple):

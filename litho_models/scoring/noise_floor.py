@@ -18,7 +18,7 @@ from litho_data.store import PrintedScan
 from litho_data.store.schema import DatasetId
 from litho_models.scan_terms import POLICIES, Blocks, CrossFit, Policy, cross_fit
 from litho_models.scoring.like_layouts import LikePixels, like_pixels
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.statistics import Interval, pixel_interval
 
 NOISE_FILE = "noise.json"
 
@@ -33,9 +33,9 @@ class PolicyFloor(Record):
     policy: Policy
     k: float
     mae_nm: float
-    mae_ci95_nm: tuple[float, float] | None
+    mae_ci95_nm: Interval
     rmse_nm: float
-    rmse_ci95_nm: tuple[float, float] | None
+    rmse_ci95_nm: Interval
 
 
 class NoiseFloor(Record):

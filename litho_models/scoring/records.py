@@ -16,10 +16,9 @@ from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
-from litho_models.scoring.statistics import OverUnits, over_prints, over_units
+from litho_models.scoring.statistics import Interval, OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
-Interval = tuple[float, float] | None
 LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
 """The error by which models are ranked and compared, by the instrument."""
 
@@ -159,7 +158,7 @@ class Paired(Record):
     first: str
     second: str
     mean_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     p: float
     first_better: int
     scans: int
