@@ -10,8 +10,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
+# None with fewer than ``FEWEST_FOR_INTERVAL`` units.
 Interval = tuple[float, float] | None
-"""A 95 % interval; None with fewer than ``FEWEST_FOR_INTERVAL`` units."""
 # Fewest units for p below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
