@@ -201,7 +201,7 @@ def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_re
     assert len(scored.scores.scans) == 8
     assert len(scored.split.lock_box) == 1
     assert scored.split.lock_box_opened
-    assert f"scored ones: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
+    assert f"are scored too: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
 
 
 def listed_store(path, scans, lab, name):
