@@ -1,7 +1,7 @@
 """The card of a frozen model: its use, its origin, and its errors."""
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
@@ -56,13 +56,14 @@ class ModelCard(RunFacts, Result):
     fitted value on a bound of its range to that bound. ``baseline`` contains the figures (``ScanFigures``) of
     the scans from which the model was made; ``litho-models check`` compares new prints with them.
     ``attributed`` says to which side each effect of undetermined role was attributed when the model was
-    frozen; older cards list those of the printer in ``declared_processes``.
+    frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
 
-    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
-    FILE_NAME: ClassVar[str] = CARD_FILE
+    FORMER = frozenset({"declared_processes", "unexplained_fraction", "fabrication_batch", "optimiser_gap"})
+    SCHEMA = "litho-models/frozen/1"
+    FILE_NAME = CARD_FILE
 
     name: PlainName
     model: str
@@ -89,12 +90,8 @@ class ModelCard(RunFacts, Result):
     process_effects: EffectValues = Field(default_factory=dict)
     measurement_effects: EffectValues = Field(default_factory=dict)
     undetermined_effects: EffectValues = Field(default_factory=dict)
-    declared_processes: list[str] = Field(default_factory=list)
     attributed: dict[str, Attribution] = Field(default_factory=dict)
     confusable_sets: list[list[str]] = Field(default_factory=list)
-    unexplained_fraction: float | None = None
-    fabrication_batch: str = ""
-    optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
 
     @property

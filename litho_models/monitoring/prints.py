@@ -1,7 +1,7 @@
 """The record ``check.json`` and its figures: one value per print, and the spread of these values."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -85,10 +85,7 @@ class Spread(NamedTuple):
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
     """Return the prints in printing order, by the first scan of each."""
-    first: dict[str, tuple[int, str]] = {}
-    for row in rows:
-        first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
-    return sorted(first, key=first.__getitem__)
+    return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
@@ -115,11 +112,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     scans, rest = int(prints.counts.sum()), 0.0
     for name, value in zip(prints.names, prints.values, strict=True):
         rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
-    if scans == n:
-        return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
-    within = rest / (scans - n)
+    within = rest / (scans - n) if scans > n else None
     # The variance of the means of prints is the variance between prints plus the mean part of the scans.
-    between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
+    between = max(sd**2 - (within or 0.0) * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
 
@@ -148,7 +143,7 @@ class FigureCheck(Record):
     %.
 
     ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p value of a
-    change. An alarm is raised if it is at most ``alarm_at``, the figure's share of the rate.
+    change. An alarm is raised if ``p`` is at most ``alarm_at``, the figure's share of the rate.
     ``noticeable_step`` is the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
     cases; a fall by r/(1 + r) is noticed equally. ``noticeable_step`` is None beyond a factor of e. ``trend``
     is the change per print over all prints. ``measure_again_in`` is the number of prints until the 95 % bound
@@ -178,8 +173,8 @@ class Check(Result):
     ``false_alarm_rate`` is the chance that a data set like this from an unchanged printer raises an alarm.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/check/2"
-    FILE_NAME: ClassVar[str] = "check.json"
+    SCHEMA = "litho-models/check/2"
+    FILE_NAME = "check.json"
 
     run: RunInfo
     dataset: DatasetId

@@ -2,10 +2,7 @@
 it.
 """
 
-from typing import ClassVar
-
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
@@ -18,13 +15,11 @@ from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 from litho_models.scoring.statistics import rms
 
 
-class NoiseAnalysis(Result):
+class NoiseAnalysis(Result, extra="ignore"):
     """``noise.json``."""
 
-    model_config = ConfigDict(extra="ignore")
-
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = "noise.json"
+    SCHEMA = "litho-models/noise/1"
+    FILE_NAME = "noise.json"
 
     run: RunInfo
     dataset: DatasetId | None

@@ -11,6 +11,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
+# None with fewer than ``FEWEST_FOR_INTERVAL`` units.
+Interval = tuple[float, float] | None
 # Fewest units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
@@ -51,7 +53,7 @@ def bootstrap_interval(
     return _resampled(sums, counts, draws, seed)
 
 
-def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> tuple[float, float] | None:
+def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
     """Return the interval of a mean over pixels, by resampling prints, each of which counts with its pixels.
 
     Return None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
@@ -84,7 +86,7 @@ def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Arr
     return np.bincount(members, sample), np.bincount(members).astype(np.float64)
 
 
-def interval(values: Sequence[float]) -> tuple[float, float] | None:
+def interval(values: Sequence[float]) -> Interval:
     """Return what ``bootstrap_interval`` does, but None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
@@ -124,7 +126,7 @@ class OverUnits(Record):
 
     count: int
     positive: int
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     p: float
     smallest_p: float
 
