@@ -10,16 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Shape
 from litho_data.readers import vendor
 from litho_data.readers.arrays import read_hdf5
-from litho_data.readers.confined import confined
-from litho_data.readers.reader import (
-    Channel,
-    Loaded,
-    Reader,
-    extent_um,
-    foreign_parser,
-    in_memory,
-    one_by_one,
-)
+from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, in_memory, one_by_one
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _JPK = b"JPK SCAN"
@@ -46,7 +37,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     import h5py
 
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         if file.attrs.get("file-format-info") == _JPK:
             channels = [channel for name in sorted(file) for channel in _jpk_channels(path, file[name])]
         elif "topostats_file_version" in file:
@@ -91,7 +82,7 @@ def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
     """Values in the default calibration; y of the grid points up, so its last row comes first."""
     import h5py
 
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         counts, scaling = file[name], file[name].parent.attrs
         measurement = file[name].parent.parent
         column, row = measurement["Position_Indices"][()].astype(int).T
@@ -150,7 +141,7 @@ def _first(attributes: Any, names: tuple[str, ...]) -> Any:
 def _load_nanosurf(path: Path, name: str, shape: Shape, range_: tuple[float, float]) -> Loaded:
     import h5py
 
-    with foreign_parser(path, "NHF"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         counts, fill = file[name][()].reshape(shape), file[name].fillvalue
     info = np.iinfo(counts.dtype)
     values = (counts.astype(float) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
@@ -176,5 +167,5 @@ def _text(value: Any) -> str:
 
 
 READER = Reader(
-    "hdf5", lambda path, head: head.startswith(_MAGIC), confined(read_channels, ("h5py", *vendor.IMPORTS))
+    "hdf5", lambda path, head: head.startswith(_MAGIC), read_channels, ("h5py", *vendor.READER.parsers)
 )

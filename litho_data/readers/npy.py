@@ -28,7 +28,7 @@ def read_channels(path: Path) -> list[Channel]:
     array = load_array(path)
     if array.ndim != 2:
         raise InputError(f"{path}: shape", got=array.shape, wanted="two dimensions (ny, nx)")
-    return [array_channel("array", array.dtype, array.shape, partial(np.array, array), {})]
+    return [array_channel("array", Held(array.dtype, array.shape, partial(np.array, array)))]
 
 
 def read_archive(path: Path) -> list[Channel]:
@@ -40,7 +40,7 @@ def read_archive(path: Path) -> list[Channel]:
         InputError: damaged file.
     """
     held: dict[str, Held] = {}
-    with foreign_parser(path, "NPZ"), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             with archive.open(member) as stream:
                 shape, _, dtype = _READ_HEADER[np.lib.format.read_magic(stream)](stream)
@@ -54,7 +54,7 @@ def read_archive(path: Path) -> list[Channel]:
 
 
 def _member(path: Path, name: str) -> Array:
-    with foreign_parser(path, "NPZ"), np.load(path, allow_pickle=False) as archive:
+    with np.load(path, allow_pickle=False) as archive:
         return archive[name]
 
 

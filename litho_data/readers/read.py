@@ -12,6 +12,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import um_per
+from litho_data.readers.confined import parse
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked
 from litho_data.readers.reader import (
@@ -123,7 +124,8 @@ def _load_packed(path: Path, format: str, name: str) -> Loaded:
 
 
 def _read_channels(reader: Reader, file: Path) -> list[Channel]:
-    channels = with_unique_names(reader.read_channels(file))
+    run = partial(parse, path=file, kind=reader.name, parsers=reader.parsers)
+    channels = with_unique_names(run(partial(reader.read_channels, file)))
     if not channels:
         raise InputError(f"{file} ({reader.name}) holds no two-dimensional map of numbers")
     size = file.stat().st_size
@@ -131,7 +133,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
             raise InputError(f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED)
-    return [_with_unit_of_name(one) for one in channels]
+    return [_with_unit_of_name(replace(one, load=partial(run, one.load))) for one in channels]
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:

@@ -101,12 +101,16 @@ class Reader:
     Args:
         name: as in ``format = "…"`` of a card and ``--format`` of the commands.
         recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
-        read_channels: the channels of a file, in the order of the file; InputError where it is damaged.
+        read_channels: the channels of a file, in the order of the file. Any exception of it, or of the
+            loading of a channel, becomes one line about the file.
+        parsers: modules of other projects that it uses. It then runs in a child process within limits of
+            time and memory, so it must be importable by name, and its results must be picklable.
     """
 
     name: str
     recognises: Callable[[Path, bytes], bool]
     read_channels: Callable[[Path], list[Channel]]
+    parsers: tuple[str, ...] = ()
 
 
 def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
@@ -184,6 +188,8 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
+        if isinstance(error, MemoryError):
+            reason = "a parser that asked for more memory than such a file can need"
         cut = isinstance(error, _OF_CUT_FILES) or _CUT.search(reason)
         what = (
             f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"

@@ -16,7 +16,6 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
 from litho_data.readers.text_blocks import header_of
 
@@ -244,6 +243,4 @@ def is_tiff(head: bytes) -> bool:
     return head.startswith(_MAGIC)
 
 
-READER = Reader(
-    "tiff", lambda path, head: is_tiff(head), confined(read_channels, ("tifffile", "imagecodecs"))
-)
+READER = Reader("tiff", lambda path, head: is_tiff(head), read_channels, ("tifffile", "imagecodecs"))

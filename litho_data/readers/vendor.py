@@ -13,7 +13,6 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
-from litho_data.readers.confined import confined
 from litho_data.readers.reader import (
     DAMAGED,
     Channel,
@@ -28,7 +27,6 @@ from litho_data.readers.tiff import is_tiff, maker_of
 from litho_data.scan import Axis
 
 _HEAD_BYTES = 512
-IMPORTS = ("SurfaceTopography.IO", "igor2.binarywave")
 # How files of formats with a signature start. Formats without a signature are left out, because any bytes of
 # the right length would pass as a map.
 _STARTS: dict[str, tuple[bytes, ...]] = {
@@ -80,7 +78,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     kind = _recognise(path)
     header = _vendor_header(path, kind)
-    with foreign_parser(path, kind), _open(path, kind) as reader:
+    with _open(path, kind) as reader:
         maps = [info for info in reader.channels if info.dim == 2 and min(info.nb_grid_pts) > 1]
         channels = [
             one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
@@ -188,7 +186,7 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
     # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
-    with foreign_parser(path, kind), _open(path, kind) as reader:
+    with _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
         values: Array = np.ma.filled(np.ma.asarray(heights, dtype=float), np.nan)
     return np.ascontiguousarray(values.T), None
@@ -235,8 +233,7 @@ def _layer_names(path: Path, kind: str) -> list[str]:
 def _igor_wave(path: Path) -> dict[str, Any]:
     from igor2 import binarywave
 
-    with foreign_parser(path, "ibw"):
-        return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
+    return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
 
 
 def _igor_note(path: Path) -> dict[str, str]:
@@ -268,4 +265,9 @@ def _nanoscope_header(path: Path) -> dict[str, str]:
     return header
 
 
-READER = Reader("vendor", lambda path, head: bool(_kinds(path, head)), confined(read_channels, IMPORTS))
+READER = Reader(
+    "vendor",
+    lambda path, head: bool(_kinds(path, head)),
+    read_channels,
+    ("SurfaceTopography.IO", "igor2.binarywave"),
+)

@@ -18,7 +18,7 @@ import tifffile
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import Channel, list_channels, read_scan
-from litho_data.readers.confined import confined
+from litho_data.readers.confined import parse
 from tests.litho_data import afm_files
 from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 
@@ -141,10 +141,11 @@ def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pyt
         waiting = 2 if parser is _asleep else 500
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", waiting)
         with pytest.raises(InputError, match=message):
-            confined(parser, ())(path)
+            parse(partial(parser, path), path, "toy", ("json",))
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", 500)
         # The next file finds a parser at work again.
-        assert confined(_whole, ())(path)[0].load()[0, 0, 0] == 7
+        found = parse(partial(_whole, path), path, "toy", ("json",))
+        assert parse(found[0].load, path, "toy", ("json",))[0, 0, 0] == 7
     assert time.process_time() - start < 2
 
 
