@@ -6,7 +6,6 @@ from litho_data.level.plane import (
     fix_zero,
     level_facet,
     level_plane,
-    level_three_point,
     zero_max,
     zero_mean,
 )
@@ -30,7 +29,6 @@ __all__ = [
     "level_plane",
     "level_polynomial",
     "level_robust",
-    "level_three_point",
     "mark_features",
     "mark_scars",
     "mask_and_relevel",

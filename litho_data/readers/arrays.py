@@ -196,9 +196,7 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
     return np.ascontiguousarray(values[:, :: -1 if mirrored else 1]), None
 
 
-def channels_of(
-    path: Path, kind: str, arrays: Mapping[str, Held], around: Mapping[str, Any] | None = None
-) -> list[Channel]:
+def channels_of(arrays: Mapping[str, Held], around: Mapping[str, Any] | None = None) -> list[Channel]:
     """One channel per map in a file without groups; ``around`` is what the file says about all of them.
 
     Arrays along one dimension are coordinates, and single values say something about all others.
@@ -212,7 +210,7 @@ def channels_of(
         return array_channel(name, replace(one, coordinates=lines, around={**(around or {}), **single}))
 
     maps = ((name, one) for name, one in arrays.items() if one.is_map)
-    return [one_by_one(path, kind, name, partial(channel, name, one)) for name, one in maps]
+    return [one_by_one(name, partial(channel, name, one)) for name, one in maps]
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
@@ -229,7 +227,7 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
         return array_channel(item.name.strip("/"), _hdf5_array(path, item, matlab))
 
     maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
-    return [one_by_one(path, "HDF5", item.name.strip("/"), partial(channel, item)) for item in maps]
+    return [one_by_one(item.name.strip("/"), partial(channel, item)) for item in maps]
 
 
 def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
@@ -313,7 +311,7 @@ def read_netcdf(path: Path) -> list[Channel]:
             )
             for name, one in file.variables.items()
         }
-        return channels_of(path, "NetCDF", held, dict(file._attributes))
+        return channels_of(held, dict(file._attributes))
 
 
 def read_matlab(path: Path) -> list[Channel]:
@@ -327,7 +325,7 @@ def read_matlab(path: Path) -> list[Channel]:
 
     found = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
     arrays = {name: Held.in_memory(one) for name, one in found.items() if not one.dtype.hasobject}
-    return channels_of(path, "MATLAB", arrays)
+    return channels_of(arrays)
 
 
 _PARSERS = ("scipy.io", "h5py")

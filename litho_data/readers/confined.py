@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import foreign_parser
+from litho_data.readers.reader import DAMAGED, foreign_parser
 
 T = TypeVar("T")
 
@@ -39,12 +39,12 @@ def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, 
     With ``parsers``, modules that it needs, it runs in the child process, and has to be picklable. Without
     POSIX it runs in this process.
     """
-    guarded = partial(_guarded, function, path, kind)
+    guarded = partial(_guarded, function, kind)
     return _CHILD.call(guarded, path, parsers) if parsers and os.name == "posix" else guarded()
 
 
-def _guarded(function: Callable[[], T], path: Path, kind: str) -> T:
-    with foreign_parser(path, kind):
+def _guarded(function: Callable[[], T], kind: str) -> T:
+    with foreign_parser(kind):
         return function()
 
 
@@ -74,9 +74,7 @@ class _Child:
                     raise TimeoutError
                 result, refusal = self._pipe.recv()
             except (EOFError, OSError) as error:
-                raise InputError(
-                    f"cannot read {path}", got=self._end(error, computing_s), hint="the file may be damaged"
-                ) from error
+                raise InputError("cannot be read", got=self._end(error, computing_s), hint=DAMAGED) from error
             except BaseException:
                 self.stop()  # A late answer must not count as the answer for the next file.
                 raise

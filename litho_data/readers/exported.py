@@ -137,12 +137,7 @@ def _pairs(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _gwl_levels(
-    path: Path,
-    shape: Shape,
-    pitch_um: float,
-    level_height_um: float,
-    pedestal_um: float,
-    slicing_um: float,
+    path: Path, shape: Shape, pitch_um: float, level_height_um: float, pedestal_um: float, slicing_um: float
 ) -> Array:
     """Levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
 
@@ -193,28 +188,16 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Levels per cell uint8 (ny, nx), row 0 on top, from the flat faces on top of the solid.
+    """Levels per cell uint8 (ny, nx), row 0 on top, from the faces on top of the solid; each lies in one cell.
 
-    Along the middle of every row of cells each face covers the cells between two of its edges.
+    Raises:
+        InputError: a cell without a face on top.
     """
     corners = read_stl_triangles(path).astype(np.float64)
     flat = corners[(np.ptp(corners[..., 2], axis=1) == 0) & (corners[:, 0, 2] > 0)]
-    level = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um).astype(np.int64)
-    places = flat[..., :2] / cell_um
-    first, last = (np.ceil(edge(places[..., 1], axis=1) - 0.5).astype(int) for edge in (np.min, np.max))
-    face = np.repeat(np.arange(len(flat)), last - first)
-    row = np.arange(len(face)) + np.repeat(last - np.cumsum(last - first), last - first)
-    ends = np.array([[np.inf], [-np.inf]]).repeat(len(face), 1)
-    for one, other in ((0, 1), (1, 2), (2, 0)):
-        low, high = places[face, one], places[face, other]
-        # Computed from the lower end in every face, so that both faces at an edge get the same number.
-        down = (low[:, 1] > high[:, 1])[:, None]
-        (x0, y0), (x1, y1) = np.where(down, high, low).T, np.where(down, low, high).T
-        met = (y0 <= row + 0.5) & (row + 0.5 < y1)
-        x = x0[met] + (row[met] + 0.5 - y0[met]) / (y1 - y0)[met] * (x1 - x0)[met]
-        ends[0, met], ends[1, met] = np.minimum(ends[0, met], x), np.maximum(ends[1, met], x)
-    begin, end = np.ceil(ends - 0.5).astype(int)
-    steps = np.zeros((shape[0], shape[1] + 1), np.int64)
-    np.add.at(steps, (row, begin), level[face])
-    np.add.at(steps, (row, end), -level[face])
-    return steps.cumsum(1)[::-1, :-1].astype(np.uint8)
+    column, row = np.floor(flat[..., :2].mean(axis=1) / cell_um).astype(int).T
+    found = np.full(shape, -1)
+    found[shape[0] - 1 - row, column] = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um)
+    if found.min() < 0:
+        raise InputError(f"STL {path}", got="a cell without a top", wanted="a face on top of every cell")
+    return found.astype(np.uint8)

@@ -29,7 +29,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
-        raise InputError(f"{path} is no Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
+        raise InputError("no Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
     content, end = _object(data, len(_MAGIC), len(data))
     if end != len(data):
         raise EOFError(f"{len(data)} bytes where {end} are wanted")
@@ -38,12 +38,12 @@ def read_channels(path: Path) -> list[Channel]:
     )
     titles = [str(content.get(f"/{number}/data/title", f"channel {number}")) for number in numbers]
     return [
-        one_by_one(path, "GWY", title, partial(_channel, path, content, number, title))
+        one_by_one(title, partial(_channel, content, number, title))
         for number, title in zip(numbers, titles, strict=True)
     ]
 
 
-def _channel(path: Path, content: dict[str, Any], number: str, title: str) -> Channel:
+def _channel(content: dict[str, Any], number: str, title: str) -> Channel:
     field, mask = content[f"/{number}/data"], content.get(f"/{number}/mask")
     shape = (int(field["yres"]), int(field["xres"]))
     return Channel(
@@ -51,7 +51,7 @@ def _channel(path: Path, content: dict[str, Any], number: str, title: str) -> Ch
         shape=shape,
         unit=_unit(field, "si_unit_z"),
         size_um=extent_um(field.get("yreal", 0), field.get("xreal", 0), _unit(field, "si_unit_xy")),
-        load=partial(_load, f"{path} {title}", field, mask, shape),
+        load=partial(_load, title, field, mask, shape),
         header={key: str(value) for key, value in content.get(f"/{number}/meta", {}).items()},
     )
 

@@ -62,7 +62,7 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
         name = says["channel.fancy-name"] + (", retrace" if says.get("retrace") == "true" else "")
         for values in (one for key, one in sorted(group.items()) if key != "thumbnail"):
             if values.shape[0] != shape[0] * shape[1]:
-                raise InputError(f"{path} {values.name}: pixels", got=values.shape[0], wanted=shape)
+                raise InputError(f"{values.name}: pixels", got=values.shape[0], wanted=shape)
             channels += [
                 Channel(
                     name=name if values.shape[1] == 1 else f"{name}, frame {frame + 1}",
@@ -105,7 +105,7 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
                     label = _text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
                     name = ", ".join(filter(None, (_text(_first(item.attrs, _NAMES)), label)))
                     make = partial(_nanosurf_channel, path, item, says, name)
-                    channels.append(one_by_one(path, "NHF", name, make))
+                    channels.append(one_by_one(name, make))
     return channels
 
 

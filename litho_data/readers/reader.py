@@ -113,10 +113,10 @@ class Reader:
     parsers: tuple[str, ...] = ()
 
 
-def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
+def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
     """The channel, or one that says why it cannot be read, so that the other channels stay usable."""
     try:
-        with foreign_parser(path, kind):
+        with foreign_parser("a map"):
             return make()
     except InputError as error:
         return Channel(name, (0, 0), None, None, partial(_refuse, str(error)), problem=str(error))
@@ -143,9 +143,9 @@ def extent_um(y: float, x: float, unit: str | None) -> YX | None:
     return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
-def unknown_content(path: Path, head: bytes) -> InputError:
+def unknown_content(head: bytes) -> InputError:
     """The error for a file that no reader recognises."""
-    return InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
+    return InputError("format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
@@ -175,8 +175,8 @@ def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
 
 
 @contextmanager
-def foreign_parser(path: Path, kind: str) -> Iterator[None]:
-    """Run another project's parser; any exception becomes one InputError about the file.
+def foreign_parser(kind: str) -> Iterator[None]:
+    """Run another project's parser of such a file; any exception becomes one InputError.
 
     On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
     errors, and log to stderr; a caller can do nothing with these.
@@ -191,7 +191,5 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
         if isinstance(error, MemoryError):
             reason = "a parser that asked for more memory than such a file can need"
         cut = isinstance(error, _OF_CUT_FILES) or _CUT.search(reason)
-        what = (
-            f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"
-        )
+        what = f"cannot be read as {kind}" if cut else f"unknown kind of {kind}"
         raise InputError(what, got=reason[:_LONGEST_MESSAGE], hint=DAMAGED if cut else "") from error

@@ -72,7 +72,7 @@ def detect_format(path: Path) -> str:
     for reader in _READERS:
         if reader.recognises(path, head):
             return reader.name
-    raise unknown_content(path, head)
+    raise unknown_content(head)
 
 
 def require_file(path: str | Path) -> Path:

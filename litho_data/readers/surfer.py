@@ -22,7 +22,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
-        raise InputError(f"{path} is no Surfer grid", got=repr(raw[:4]), wanted="DSAA, DSBB or DSRB")
+        raise InputError("no Surfer grid", got=repr(raw[:4]), wanted="DSAA, DSBB or DSRB")
     values, step_y, step_x, blank = _sections(raw) if raw.startswith(b"DSRB") else _older(raw)
     values = np.where(values >= blank, np.nan, values)[::-1]
     extent = step_y * values.shape[0], step_x * values.shape[1]

@@ -153,13 +153,13 @@ def read_text(path: Path) -> str:
         text = raw.decode(code)
     except UnicodeDecodeError as error:
         if code != "utf-8-sig":
-            raise InputError(f"cannot read {path} as UTF-16", got=error.reason, hint=DAMAGED) from error
+            raise InputError("cannot be read as UTF-16", got=error.reason, hint=DAMAGED) from error
         text = raw.decode("latin-1")
     text = without_quotes(text.replace("\r\n", "\n").replace("\r", "\n"))
     if strange := _STRANGE.search(text):
         line = text.count("\n", 0, strange.start()) + 1
         got = f"byte 0x{ord(strange[0]):02x}"
-        raise InputError(f"{path} line {line}", got=got, wanted="a text of numbers")
+        raise InputError(f"line {line}", got=got, wanted="a text of numbers")
     return text
 
 

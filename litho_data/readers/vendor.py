@@ -80,9 +80,7 @@ def read_channels(path: Path) -> list[Channel]:
     header = _vendor_header(path, kind)
     with _open(path, kind) as reader:
         maps = [info for info in reader.channels if info.dim == 2 and min(info.nb_grid_pts) > 1]
-        channels = [
-            one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
-        ]
+        channels = [one_by_one(str(one.name), partial(_channel, path, kind, one, header)) for one in maps]
     names = _layer_names(path, kind)
     if len(names) == len(channels) == 1 and names[0]:
         channels = [replace(channels[0], name=names[0])]
@@ -129,14 +127,14 @@ def _recognise(path: Path) -> str:
                 _require_whole_igor_file(path, head)
             found = int.from_bytes(head[_SURFACE_KIND_AT : _SURFACE_KIND_AT + 2], "little")
             if kind == "sur" and found in _NO_SURFACES:
-                raise InputError(f"{path} (sur): kind of studiable", got=found, wanted="one surface (2)")
-            with foreign_parser(path, kind), _open(path, kind):
+                raise InputError("kind of studiable", got=found, wanted="one surface (2)")
+            with foreign_parser(kind), _open(path, kind):
                 return kind
         except InputError as error:
             refusals.append(error)
     if len(refusals) == 1:
         raise refusals[0]
-    raise unknown_content(path, head)
+    raise unknown_content(head)
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
@@ -147,7 +145,7 @@ def _require_whole_igor_file(path: Path, head: bytes) -> None:
     stated = sum(struct.unpack_from(f"{order}{_IGOR_5_SIZES}", head.ljust(64, b"\0"), 4)) + 64
     if stated > path.stat().st_size:
         raise InputError(
-            f"cannot read {path} as ibw",
+            "cannot be read as ibw",
             got=f"{path.stat().st_size} bytes",
             wanted=f"the {stated} of its header",
             hint=DAMAGED,

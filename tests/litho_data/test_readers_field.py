@@ -37,7 +37,7 @@ def test_gzip_is_read_as_its_content(tmp_path: Path, suffix: str) -> None:
     assert (scan.name, scan.source) == ("scan", str(packed))
     np.testing.assert_allclose(list_channels(packed)[0].load()[0], HEIGHT_UM * 1e-6, rtol=1e-6)
     packed.write_bytes(packed.read_bytes()[:-20])
-    with pytest.raises(InputError, match=r"cannot unpack .*\.gz"):
+    with pytest.raises(InputError, match=r"\.gz: cannot be unpacked"):
         read_scan(packed, unit="m")
 
 
