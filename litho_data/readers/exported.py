@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,31 +110,15 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Levels uint8 (ny, nx), row 0 on top, from closed polylines."""
+    """Levels uint8 (ny, nx), row 0 on top, from closed polylines; each begins with its layer and a dummy."""
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)
-    layer, x, corners = 0, 0.0, []
-    for code, value in _pairs(path):
-        if code == "8":
-            layer = int(value)
-        elif code == "10":
-            x = float(value)
-        elif code == "20":
-            corners.append((x / pitch_um, shape[0] - float(value) / pitch_um))
-        elif value == "POLYLINE":
-            corners = []
-        elif value == "SEQEND":
-            (left, top), (right, bottom) = (
-                np.rint(edge(corners[1:], axis=0)).astype(int) for edge in (np.min, np.max)
-            )
-            found[top:bottom, left:right] = level_of[layer]
+    for polyline in path.read_text("ascii").split("POLYLINE")[1:]:
+        corners = np.array(re.findall(r"\n10\n(.*)\n20\n(.*)", polyline)[1:], float) / pitch_um
+        left, low = np.rint(corners.min(axis=0)).astype(int)
+        right, high = np.rint(corners.max(axis=0)).astype(int)
+        found[shape[0] - high : shape[0] - low, left:right] = level_of[int(polyline.split()[1])]
     return found
-
-
-def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    with open(path, encoding="ascii") as stream:
-        for code in stream:
-            yield code.strip(), next(stream).strip()
 
 
 def _gwl_levels(
@@ -188,7 +173,7 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Levels per cell uint8 (ny, nx), row 0 on top, from the faces on top of the solid; each lies in one cell.
+    """Levels per cell uint8 (ny, nx), row 0 on top, from the faces on top of the solid, each in one cell.
 
     Raises:
         InputError: a cell without a face on top.
