@@ -19,10 +19,10 @@ from litho_data.foundation.run_facts import software_record
 from litho_data.making.assemble import Source, assemble, records_of_use
 from litho_data.making.calibration import measure_scales, standards_of
 from litho_data.making.day_tip import with_tip_found
-from litho_data.making.jobs import FieldJob, Job, Skipped, field_jobs, finish
+from litho_data.making.jobs import FieldJob, Job, field_jobs, finish
 from litho_data.making.operations import UNREGISTERED, load_recipe, no_recipe
 from litho_data.making.report import write_report
-from litho_data.making.result import BuildResult, LeftOut, report_folder
+from litho_data.making.result import BuildResult, report_folder
 from litho_data.making.right_layout import doubts, fitting_layout, prints_of
 from litho_data.making.verdict import Weight, findings, odd_heights, require_heights
 from litho_data.sharing.workers import HERE, Workers, run_jobs
@@ -122,10 +122,10 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             finished = run_jobs(making, todo, workers, name=lambda job: job.id)
             what = f"building {source.card.name}"
             for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
-                if isinstance(outcome, Skipped):
+                if isinstance(outcome, str):
                     # Names as recorded, because the manifest must not depend on where the raw files lie.
-                    skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
-                    _report_skipped(outcome.id, skipped[outcome.id])
+                    skipped[job.id] = outcome.replace(f"{source.data_dir}{os.sep}", "")
+                    _report_skipped(job.id, skipped[job.id])
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
@@ -170,8 +170,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             n_scans=len(of_use),
             n_references=len(kept) - len(of_use),
             findings=found,
-            skipped=_left_out(skipped),
-            unpaired=_left_out(source.unpaired),
+            skipped=dict(sorted(skipped.items())),
+            unpaired=dict(sorted(source.unpaired.items())),
             reused=reused,
             seconds=round(time.perf_counter() - clock, 2),
             workers=workers.processes,
@@ -255,7 +255,3 @@ def _require_enough(
         )
     if not records_of_use(list(records.values())):
         raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")
-
-
-def _left_out(reasons: Mapping[str, str]) -> list[LeftOut]:
-    return [LeftOut(id=scan_id, reason=reason) for scan_id, reason in sorted(reasons.items())]

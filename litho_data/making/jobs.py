@@ -41,23 +41,15 @@ class Job(Protocol):
         """Make the piece; InputError if the files do not allow it."""
 
 
-@dataclass(frozen=True)
-class Skipped:
-    """A field that could not be used, and why."""
-
-    id: str
-    reason: str
-
-
-def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
+def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | str:
     """Run a job, keep its piece and return the record of the piece; arrays stay where they are made.
 
-    Bad input becomes a reason for skipping, so one bad file never stops a build.
+    Bad input becomes a reason for skipping, as a text, so one bad file never stops a build.
     """
     try:
         piece = job.run()
     except InputError as error:
-        return Skipped(job.id, str(error))
+        return str(error)
     unfinished.add(piece)
     return piece.record
 

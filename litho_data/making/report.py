@@ -81,7 +81,11 @@ def _left_out(page: Page, result: BuildResult) -> None:
         table = [{"scan": one.scan, "what": one.text} for one in result.findings]
         page.table(table, "Findings against the dataset, worst first", "findings.csv")
     apart = {"skipped": result.skipped, "unpaired": result.unpaired}
-    rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
+    rows = [
+        {"id": key, "status": how, "reason": reason}
+        for how, reasons in apart.items()
+        for key, reason in reasons.items()
+    ]
     if rows:
         page.heading("Not in the store")
         caption = "Ids that are not in the store, and why; with `--strict` the build is refused instead"
