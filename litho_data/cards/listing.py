@@ -8,11 +8,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
-from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table, size_of
+from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
@@ -96,7 +96,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     print_ids = dict(zip(ids, prints_of(ids, card.ids.print), strict=True))
     for scan_id in ids:
         row = table.get(scan_id, {})
-        use = cast(Use, row.get("use", "dataset"))
+        use: Use = row.get("use", "dataset")
         files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
         every = tuple(one for found in files for one in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
@@ -119,18 +119,13 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             PrintedField(
                 id=scan_id,
                 print_id=print_id or scan_id,
-                order=int(row["order"]) if "order" in row else len(fields),
+                order=row.get("order", len(fields)),
                 use=use,
                 scan=scans[scan_id][0],
                 layout=layouts[scan_id][0] if scan_id in layouts else None,
                 full_scale_um=scale,
-                columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row}
-                | {name: row[name] for name in TEXT_COLUMNS if name in row},
-                read={
-                    name: size_of(row[name]) if name == "size_um" else row[name]
-                    for name in READ_COLUMNS
-                    if name in row
-                },
+                columns={name: row[name] for name in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) if name in row},
+                read={name: row[name] for name in READ_COLUMNS if name in row},
             )
         )
     if card.grating is None and (unknown := [one.id for one in fields if one.use == "grating"]):
@@ -183,7 +178,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 
 
 def _refusal(
-    scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, str]], card: Card
+    scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, Any]], card: Card
 ) -> str:
     """Why an id cannot be used although it has all files; empty if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
@@ -201,7 +196,7 @@ def leads_out(files: tuple[Path, ...], folder: Path) -> str:
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
 
 
-def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
+def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
     if card.ids.table is None:
         return {}
     path = next((folder / card.ids.table for folder in folders if (folder / card.ids.table).is_file()), None)
@@ -212,7 +207,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
     return read_table(path)
 
 
-def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+def _assumptions(card: Card, table: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
     """Facts that the card does not state and that are assumed for the effects that need them."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:
