@@ -2,8 +2,8 @@
 
 import io
 import re
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 
@@ -49,14 +49,11 @@ def numbers_of(block: Block) -> Table:
 
 def _numbers(text: str, first_line: int) -> Table:
     text, separator = _plain(text, first_line)
-    try:
+    with suppress(ValueError):
         values = np.loadtxt(io.StringIO(text), delimiter=separator, dtype=float, comments=None, ndmin=2)
-        table = Table(values, {})
-    except ValueError:
-        table = _cell_by_cell(text, separator, first_line)
-    if np.isinf(table.values).any():
-        _refuse_overflow(text, separator, first_line)
-    return table
+        if not np.isinf(values).any():
+            return Table(values, {})
+    return _cell_by_cell(text, separator, first_line)
 
 
 def _plain(text: str, first_line: int) -> tuple[str, str | None]:
@@ -124,7 +121,7 @@ def _refuse_decimal_commas(text: str, first_line: int) -> None:
 
 def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:
     rows = [
-        (line, [cell.strip() for cell in (row.split(separator) if separator else row.split())])
+        (line, [cell.strip() for cell in row.split(separator)])
         for line, row in enumerate(text.split("\n"), start=first_line)
         if row.strip()
     ]
@@ -133,24 +130,34 @@ def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:
         rows[0][1].insert(0, "")  # the corner between a column and a row of coordinates
     width, width_line = len(rows[0][1]), rows[0][0]
     words: dict[str, int] = {}
-    corner = None if _is_number(rows[0][1][0]) else rows[0][1][0]
+    corner = rows[0][1][0] if _number(rows[0][1][0]) is None else None
     values = np.full((len(rows), width), np.nan)
     for number, (line, cells) in enumerate(rows):
+        found = [_number(cell) for cell in cells]
         if len(cells) != width:
-            _refuse_ragged(line, len(cells), f"{width} values as in line {width_line}", cells)
-        for column, cell in enumerate(cells):
-            if _is_number(cell):
-                values[number, column] = float(cell)
+            for cell, value in zip(cells, found, strict=True):
+                if value is None and cell:
+                    raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number")
+            wanted = f"{width} values as in line {width_line}"
+            raise InputError(f"line {line}", got=f"{len(cells)} values", wanted=wanted, hint=_TRUNCATED)
+        for column, (cell, value) in enumerate(zip(cells, found, strict=True)):
+            if value is not None:
+                values[number, column] = value
+                # A number like 1e400 reads as an infinity that was not written.
+                if np.isinf(value) and "inf" not in cell.lower():
+                    raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number below 1e308")
             elif number or column:
                 words.setdefault(cell, line)
     return Table(values, words, corner)
 
 
-def _refuse_ragged(line: int, count: int, wanted: str, cells: list[str]) -> NoReturn:
-    for cell in cells:
-        if not _is_number(cell) and cell:
-            raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number")
-    raise InputError(f"line {line}", got=f"{count} values", wanted=wanted, hint=_TRUNCATED)
+def _number(cell: str) -> float | None:
+    """The number in a cell; None for a word."""
+    try:
+        # Only Python takes 1_000 for a number.
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None
 
 
 def refuse_cut_end(text: str) -> None:
@@ -170,20 +177,3 @@ def refuse_cut_end(text: str) -> None:
         wanted = f"a number spelt like {last_row[-2]!r}"
         what = f"line {line} ends inside a number"
         raise InputError(what, got=repr(last_row[-1]), wanted=wanted, hint=_TRUNCATED)
-
-
-def _refuse_overflow(text: str, separator: str | None, first_line: int) -> None:
-    """Refuse numbers too large to hold, such as 1e400, which read as an infinity that was not written."""
-    for line, row in enumerate(text.split("\n"), start=first_line):
-        for cell in row.split(separator):
-            if "inf" not in cell.lower() and _is_number(cell) and np.isinf(float(cell)):
-                raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number below 1e308")
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    # Only Python takes 1_000 for a number.
-    return "_" not in cell
