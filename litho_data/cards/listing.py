@@ -14,6 +14,7 @@ from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
 from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Facts
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
 # Longest time that a card's expression may take to match, in a process of its own.
@@ -42,7 +43,7 @@ class PrintedField:
     layout: Path | None
     full_scale_um: float | None = None
     columns: Mapping[str, float | str] = field(default_factory=dict)
-    read: Mapping[str, Any] = field(default_factory=dict)
+    read: Facts = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -177,9 +178,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
     return {scan_id: paths for scan_id, paths in found.items() if paths}
 
 
-def _refusal(
-    scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, Any]], card: Card
-) -> str:
+def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:
     """Why an id cannot be used although it has all files; empty if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may hold letters, digits, space and ._+- only"
@@ -207,7 +206,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
     return read_table(path)
 
 
-def _assumptions(card: Card, table: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
     """Facts that the card does not state and that are assumed for the effects that need them."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:

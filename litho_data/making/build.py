@@ -15,6 +15,7 @@ from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.commands.progress import progress, say
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Facts
 from litho_data.foundation.run_facts import software_record
 from litho_data.making.assemble import Source, assemble, records_of_use
 from litho_data.making.calibration import measure_scales, standards_of
@@ -84,7 +85,7 @@ def _recipe(listing: Listing) -> dict[str, Any]:
     return load_recipe(None if level is None else listing.card_path.parent / level)
 
 
-def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
+def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> Source:
     standards = standards_of(listing)
     if standards.described:
         # A bad standard spoils every scan, so it is reported once, before any scan is made.
@@ -213,7 +214,7 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     return named
 
 
-def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
+def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
     """Scans whose pixels have another aspect than most, if the size comes from the card, not from the file.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
@@ -246,7 +247,7 @@ def _report_skipped(scan_id: str, reason: str) -> None:
 
 
 def _require_enough(
-    records: Mapping[str, Mapping[str, Any]], left_out: Mapping[str, str], strict: bool, out: Path
+    records: Mapping[str, Facts], left_out: Mapping[str, str], strict: bool, out: Path
 ) -> None:
     shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
     if strict and left_out:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation.kinds import Array, Facts, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.reader import Channel, Loaded, Reader, one_by_one
 
@@ -83,10 +83,10 @@ class Held:
     dtype: np.dtype
     shape: Shape
     read: Callable[[], Array]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    attributes: Facts = field(default_factory=dict)
     dims: tuple[str, ...] = ("", "")
     coordinates: Mapping[str, Coordinate] = field(default_factory=dict)
-    around: Mapping[str, Any] = field(default_factory=dict)
+    around: Facts = field(default_factory=dict)
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
@@ -184,7 +184,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mirrored: bool) -> Loaded:
+def _values(raw: Callable[[], Array], says: Facts, turned: bool, mirrored: bool) -> Loaded:
     """Mark missing pixels in the file's own numbers, then apply scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -196,7 +196,7 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
     return np.ascontiguousarray(values[:, :: -1 if mirrored else 1]), None
 
 
-def channels_of(arrays: Mapping[str, Held], around: Mapping[str, Any] | None = None) -> list[Channel]:
+def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
     """One channel per map in a file without groups; ``around`` is what the file says about all of them.
 
     Arrays along one dimension are coordinates, and single values say something about all others.
@@ -286,7 +286,7 @@ def _dataset(path: Path, name: str) -> Array:
         return file[name][()]
 
 
-def _coordinate(values: Array, attributes: Mapping[str, Any]) -> Coordinate:
+def _coordinate(values: Array, attributes: Facts) -> Coordinate:
     unit = attributes.get("units", attributes.get("unit"))
     length = attributes.get("length")
     line = np.ravel(values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.files import read_text
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation.kinds import Array, Facts, Shape
 from litho_data.readers.gds_rows import GdsRows
 
 _SCHEMA = "litho-design/export/"
@@ -39,7 +39,7 @@ def export_of(file: Path) -> dict[str, Any]:
     return says
 
 
-def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
+def exported_levels(path: Path, says: Facts) -> Array:
     """Levels of the element alone, uint8 (ny, nx), row 0 on top.
 
     Raises:
@@ -52,7 +52,7 @@ def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
     return levels
 
 
-def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
+def exported_rows(path: Path, says: Facts) -> Any:
     """The levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
 
     Raises:

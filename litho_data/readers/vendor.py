@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation.kinds import Array, Facts
 from litho_data.readers.reader import (
     DAMAGED,
     Channel,
@@ -190,7 +190,7 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     return np.ascontiguousarray(values.T), None
 
 
-def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(content: Facts, prefix: str = "") -> Iterator[tuple[str, str]]:
     for key, value in content.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Facts
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.reports.paper import wanted_format, write_figures
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.figure import Figure
 
-    Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
+    Table = pd.DataFrame | Facts | Iterable[Facts | BaseModel]
 
 # Column of a table to its title and meaning; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
@@ -188,7 +189,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
     return pd.DataFrame([dict(_cells(row, digits)) for row in table])
 
 
-def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _cells(row: Facts | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Columns and values of a row, including those of the records in it."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):

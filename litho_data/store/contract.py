@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, damaged, require_known
-from litho_data.foundation.kinds import Array
+from litho_data.foundation.kinds import Array, Facts
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
     HEIGHT_UM,
@@ -79,7 +79,7 @@ def missing_files(path: Path) -> Iterator[str]:
                 yield from (folder + chunk for chunk in _chunks(document) if folder + chunk not in names)
 
 
-def _may_be_left_out(name: str, document: Mapping[str, Any]) -> bool:
+def _may_be_left_out(name: str, document: Facts) -> bool:
     """Whether a copy by xarray, which has no groups, may lack the chunk of this array.
 
     It writes no chunk that holds only fill values, such as order 0 of a single scan, or a column that no scan
@@ -117,7 +117,7 @@ def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
         yield from ((name, archive.read(name)) for name in wanted)
 
 
-def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
+def _chunks(document: Facts) -> Iterator[str]:
     """Names of the files of an array, below its folder."""
     sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
     encoding = document["chunk_key_encoding"]
@@ -129,7 +129,7 @@ def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
         yield between.join(numbers) or "0"
 
 
-def _by_xarray(attributes: Mapping[str, Any]) -> bool:
+def _by_xarray(attributes: Facts) -> bool:
     """Whether xarray wrote this array of booleans: it stores them as small integers and says so."""
     return attributes.get("dtype") == "bool"
 
@@ -270,7 +270,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
         )
 
 
-def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
+def require_manifest(manifest: Facts, path: Path) -> None:
     """Refuse a manifest that lacks what its readers need; a manifest with only a table is not from a build.
 
     Raises:

@@ -6,13 +6,13 @@ import html
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from litho_data.foundation.errors import damaged, unknown_name
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation.kinds import YX, Array, Facts
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,
@@ -286,6 +286,6 @@ class Store:
         return self._columns[name][row] if name in self._columns else None
 
 
-def _read_facts(row: Mapping[str, Any]) -> dict[str, Any]:
+def _read_facts(row: Facts) -> dict[str, Any]:
     facts: dict[str, Any] = json.loads(row["read"] or "{}")
     return facts

@@ -1,13 +1,13 @@
 """The dataset store at a glance: arrays, dimensions, types, units, and the hash of a dataset."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation.kinds import Array, Facts
 from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
@@ -97,7 +97,7 @@ TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
 
 
-def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | None) -> dict[str, Any]:
+def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:
     """Facts about all scans, as part of the dataset's hash.
 
     Args:
@@ -108,7 +108,7 @@ def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | Non
     return {**facts, **kind, **({"write": dict(write)} if write else {})}
 
 
-def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
+def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
     """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
 
     Args:
