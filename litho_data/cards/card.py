@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import InputError, unknown_name
 from litho_data.foundation.files import parsed
 from litho_data.foundation.names import PlainName
 from litho_data.foundation.quantities import LENGTH_UM

@@ -13,8 +13,7 @@ from typing import Any
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
 from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts, InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
 # Longest time that a card's expression may take to match, in a process of its own.

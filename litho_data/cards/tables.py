@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from litho_data.cards.card import Use
-from litho_data.foundation.errors import InputError, about, require_known
+from litho_data.foundation import InputError, about, require_known
 from litho_data.foundation.files import parsed
 from litho_data.foundation.quantities import LENGTH_UM, ORDER
 from litho_data.foundation.units import is_length

@@ -120,7 +120,7 @@ def simulate(
 
     Example: litho-data simulate --preset demo --knob laser-drift=0.05 --out fab
     """
-    from litho_data.foundation.errors import InputError
+    from litho_data.foundation import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate, simulate_plan
     from litho_data.virtual_fab.films import (
         FILM_PRINTERS,

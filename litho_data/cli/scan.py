@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from litho_data.commands.app import argument, keyword, option, takes_more
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Facts
+from litho_data.foundation import YX, Facts, InputError
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import NUMBER, number
 

@@ -9,8 +9,7 @@ import typer
 
 from litho_data.cli.scan import reads_scans
 from litho_data.commands.app import argument, option
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts, InputError
 
 if TYPE_CHECKING:
     from litho_data.tip import TipEstimate

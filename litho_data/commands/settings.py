@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import Facts, InputError, unknown_name
 from litho_data.foundation.files import parsed
-from litho_data.foundation.kinds import Facts
 from litho_data.foundation.quantities import LENGTH_UM
 
 M = TypeVar("M", bound=BaseModel)

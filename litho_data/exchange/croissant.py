@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts
 
 _VERSION = "http://mlcommons.org/croissant/1.0"
 _CONTEXT = json.loads(Path(__file__).with_name("croissant.json").read_text(encoding="utf-8"))

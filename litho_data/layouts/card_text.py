@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.cards.card import check_card
-from litho_data.foundation.kinds import YX, Array, Facts
+from litho_data.foundation import YX, Array, Facts
 
 CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, subtract

@@ -14,8 +14,7 @@ from typing import Any
 from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.commands.progress import progress, say
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.run_facts import software_record
 from litho_data.making.assemble import Source, assemble, records_of_use
 from litho_data.making.calibration import measure_scales, standards_of

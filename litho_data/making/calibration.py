@@ -11,8 +11,7 @@ import numpy as np
 
 from litho_data.cards.card import Grating
 from litho_data.cards.listing import Listing, leads_out, list_fields
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import Array, Facts
+from litho_data.foundation import Array, Facts, InputError, about
 from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation.kinds import Array, Facts
+from litho_data.foundation import Array, Facts
 from litho_data.foundation.run_facts import software_record
 from litho_data.making.operations import OPERATIONS, READERS
 from litho_data.making.step import Step

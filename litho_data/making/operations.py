@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Facts
+from litho_data.foundation import Array, Facts, InputError
 from litho_data.making.step import Files, Function, Inputs, Made, Operation, Params
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array, Facts
+from litho_data.foundation import YX, Array, Facts
 from litho_data.register.orientation import search_orientation
 from litho_data.register.refine import interior_of
 from litho_data.register.scan import at_layout_pitch

@@ -6,8 +6,7 @@ from enum import IntEnum
 import numpy as np
 
 from litho_data.cards.card import Card
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 

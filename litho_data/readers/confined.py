@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, TypeVar
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.readers.reader import DAMAGED, foreign_parser
 
 T = TypeVar("T")

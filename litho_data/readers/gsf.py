@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.readers.reader import Channel, Reader, extent_um
 from litho_data.readers.text_blocks import refuse_scales
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, one_by_one
 
 _MAGIC = b"GWYP"

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import InputError, Shape
 from litho_data.readers import vendor
 from litho_data.readers.arrays import read_hdf5
 from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, in_memory, one_by_one

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.arrays import Held, array_channel, channels_of
 from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Reader, foreign_parser
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.readers.reader import DAMAGED
 
 _GZIP = b"\x1f\x8b"

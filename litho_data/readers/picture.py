@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError, about
 from litho_data.readers.npy import load_array
 from litho_data.readers.reader import foreign_parser
 from litho_data.readers.registry import PICTURE, detect_format, require_file

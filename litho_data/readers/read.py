@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError, about
 from litho_data.foundation.quantities import HEIGHT_UM
 from litho_data.foundation.units import um_per
 from litho_data.readers.confined import parse

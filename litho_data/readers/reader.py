@@ -14,8 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, InputError, Shape
 from litho_data.foundation.units import is_length, um_per
 from litho_data.scan import Axis
 

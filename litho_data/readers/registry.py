@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import InputError, unknown_name
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 

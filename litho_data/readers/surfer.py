@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.reader import Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")

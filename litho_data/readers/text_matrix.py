@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text, without_quotes
 from litho_data.readers.text_grid import Map, map_of_points, without_axes

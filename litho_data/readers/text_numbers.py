@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.text_blocks import Block
 
 _EXPONENT = re.compile(r"[eE][+-]?\d+$")

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Facts
+from litho_data.foundation import Array, Facts, InputError
 from litho_data.readers.reader import (
     DAMAGED,
     Channel,

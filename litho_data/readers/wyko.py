@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import InputError, Shape
 from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 from litho_data.readers.text_blocks import NUMBER, Block, number, read_text
 from litho_data.readers.text_numbers import numbers_of

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.coarse import CoarseFit
 from litho_data.register.evidence import BlockShifts, bootstrap_corner_sd_px, match_blocks_of_field
 from litho_data.register.geometry import apply_transform, centre, linear_part, overlap_of

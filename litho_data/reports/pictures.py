@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

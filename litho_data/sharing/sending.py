@@ -11,8 +11,7 @@ from functools import cache, lru_cache
 from io import BytesIO
 from typing import Any
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Facts
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, damaged, require_known
-from litho_data.foundation.kinds import Array, Facts
+from litho_data.foundation import Array, Facts, InputError, damaged, require_known
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
     HEIGHT_UM,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.foundation import Array, Facts
 from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Array, Facts
 from litho_data.register.bend import Bend
 
 

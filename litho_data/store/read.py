@@ -11,8 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from litho_data.foundation.errors import damaged, unknown_name
-from litho_data.foundation.kinds import YX, Array, Facts
+from litho_data.foundation import YX, Array, Facts, damaged, unknown_name
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Facts, Shape
+from litho_data.foundation import Array, Facts, Shape
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     MIXED_UNITS,

@@ -10,8 +10,7 @@ import numpy as np
 from litho_data.cards.card import load_card
 from litho_data.cards.listing import files_by_id
 from litho_data.cards.tables import read_table
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Shape
+from litho_data.foundation import YX, InputError, Shape
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job

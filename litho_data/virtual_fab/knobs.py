@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import InputError, unknown_name
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from litho_data.foundation.errors import require_known
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import Shape, require_known
 
 
 @dataclass(frozen=True)

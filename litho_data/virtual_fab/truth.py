@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.level import level_polynomial
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
