@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 from litho_data.cards.card import Use
-from litho_data.foundation import InputError, about, require_known
-from litho_data.foundation.files import parsed
+from litho_data.foundation import InputError, about, is_length, parsed, require_known
 from litho_data.foundation.quantities import LENGTH_UM, ORDER
-from litho_data.foundation.units import is_length
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import read_text
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround

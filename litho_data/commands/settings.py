@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from litho_data.foundation import Facts, InputError, unknown_name
-from litho_data.foundation.files import parsed
+from litho_data.foundation import Facts, InputError, parsed, unknown_name
 from litho_data.foundation.quantities import LENGTH_UM
 
 M = TypeVar("M", bound=BaseModel)

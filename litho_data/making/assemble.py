@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from litho_data.cards.card import Card
-from litho_data.foundation import Array, Facts
-from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
+from litho_data.foundation import Array, Facts, array_sha256, file_sha256, record_sha256
+from litho_data.foundation.hashes import canonical_json
 from litho_data.making.jobs import Job
 from litho_data.making.operations import READERS, no_recipe
 from litho_data.store.partial import outputs_of

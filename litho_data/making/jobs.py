@@ -10,8 +10,7 @@ import numpy as np
 
 from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
-from litho_data.foundation import Array, Facts, InputError
-from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.making.chain import Chain
 from litho_data.making.operations import OPERATIONS

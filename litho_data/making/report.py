@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation import Array
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import Array, atomic_file
 from litho_data.making.gratings import GratingScan, grating_scans
 from litho_data.making.verdict import verdict_of
 from litho_data.reports.page import Page

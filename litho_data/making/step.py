@@ -9,8 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation import Array, Facts, InputError
-from litho_data.foundation.hashes import array_sha256, file_sha256, record_sha256, source_sha256
+from litho_data.foundation import Array, Facts, InputError, array_sha256, file_sha256, record_sha256
+from litho_data.foundation.hashes import source_sha256
 from litho_data.store.schema import VARIABLES
 
 PACKAGE = Path(__file__).parents[1]

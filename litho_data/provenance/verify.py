@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from litho_data.commands.progress import progress
-from litho_data.foundation import Facts, InputError, damaged
-from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation import Facts, InputError, damaged, file_sha256, record_sha256
 from litho_data.making.assemble import root_attributes, table_sha256
 from litho_data.making.operations import OPERATIONS
 from litho_data.provenance.history import Recorded, raw_folder, read_steps, require_folder, stored_array

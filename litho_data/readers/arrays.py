@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts, InputError, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import Array, Facts, InputError, Shape, is_length, um_per
 from litho_data.readers.reader import Channel, Loaded, Reader, one_by_one
 
 _NUMBERS = "uif"

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts, InputError, Shape, damaged
+from litho_data.foundation import Array, Facts, InputError, Shape, damaged, file_sha256
 from litho_data.foundation.files import read_text
-from litho_data.foundation.hashes import file_sha256
 from litho_data.readers.gds_rows import GdsRows
 
 _SCHEMA = "litho-design/export/"

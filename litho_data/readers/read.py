@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation import YX, Array, InputError, about
+from litho_data.foundation import YX, Array, InputError, about, um_per
 from litho_data.foundation.quantities import HEIGHT_UM
-from litho_data.foundation.units import um_per
 from litho_data.readers.confined import parse
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked

@@ -14,8 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation import YX, Array, InputError, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from litho_data.foundation import YX, InputError, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, InputError, Shape, is_length, um_per
 from litho_data.readers.reader import DAMAGED
 
 # In these expressions, no two neighbouring repetitions match the same characters; otherwise a long line of

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation import YX, Array, InputError, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
 from litho_data.readers.text_blocks import header_of
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from litho_data.foundation import Facts
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import Facts, atomic_file
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.reports.paper import wanted_format, write_figures
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from litho_data.commands.app import keyword, option, takes_more
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,8 +18,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts, InputError, damaged
-from litho_data.foundation.files import atomic_file, publish, unfinished
+from litho_data.foundation import Array, Facts, InputError, atomic_file, damaged
+from litho_data.foundation.files import publish, unfinished
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group

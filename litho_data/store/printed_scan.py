@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts
-from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation import Array, Facts, array_sha256, record_sha256
 from litho_data.register.bend import Bend
 
 

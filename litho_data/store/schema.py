@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts
-from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation import Array, Facts, array_sha256, record_sha256
 from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from litho_data.cards.card import load_card
 from litho_data.commands.progress import progress
-from litho_data.foundation import InputError, Shape, require_known
+from litho_data.foundation import InputError, Shape, array_sha256, record_sha256, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
