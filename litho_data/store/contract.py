@@ -195,7 +195,7 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """``scan`` (the ids), ``print``, ``order`` and the optional columns, None where a number is not stated.
+    """``scan`` (the ids), ``print``, ``order`` and all optional columns; None and "" where nothing is stated.
 
     Raises:
         InputError: no scan, an id that repeats or holds a path, columns of other lengths, or an impossible
@@ -213,17 +213,17 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     order = values_of(root, "order")
     ORDER.require(f"order of {path}", order)
     columns["order"] = [int(value) for value in order]
-    for name in OPTIONAL_COLUMNS:
+    for name, limits in OPTIONAL_COLUMNS.items():
+        columns[name] = [None] * len(ids)
         if has_child(root, name):
-            stated = [None if value != value else value for value in values_of(root, name).tolist()]
-            OPTIONAL_COLUMNS[name].require(
-                f"{name} of {path}", [value for value in stated if value is not None]
-            )
-            columns[name] = [None if value is None else float(value) for value in stated]
+            values = values_of(root, name).tolist()
+            # NaN is not equal to itself.
+            limits.require(f"{name} of {path}", [value for value in values if value == value])
+            columns[name] = [float(value) if value == value else None for value in values]
     for name in TEXT_COLUMNS:
-        if has_child(root, name):
-            columns[name] = [str(value) for value in values_of(root, name)]
-    for word in columns.get("surround", []):
+        texts = values_of(root, name) if has_child(root, name) else [""] * len(ids)
+        columns[name] = [str(text) for text in texts]
+    for word in columns["surround"]:
         require_known(f"surround of {path}", word, ("", *get_args(Surround)))
     for name, values in columns.items():
         if len(values) != len(ids):
