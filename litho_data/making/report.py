@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation import Array, atomic_file
+from litho_data.foundation import Array, atomic_file, table_beside
 from litho_data.making.gratings import GratingScan, grating_scans
 from litho_data.making.verdict import verdict_of
 from litho_data.reports.page import Page
@@ -31,7 +30,7 @@ _STAGES = {
     "residual (nm)": "RdBu_r",
 }
 # The columns of each table in order, each with its title and meaning.
-_COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
+_COLUMNS = table_beside(__file__, "columns.toml")
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:

@@ -2,12 +2,11 @@
 
 import codecs
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from litho_data.foundation import YX, InputError, Shape, is_length, um_per
+from litho_data.foundation import YX, InputError, Shape, is_length, table_beside, um_per
 from litho_data.readers.reader import DAMAGED
 
 # In these expressions, no two neighbouring repetitions match the same characters; otherwise a long line of
@@ -29,7 +28,7 @@ _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
 # Keys are compared by their letters and digits only.
 _NO_LETTER = re.compile(r"[\W_]+")
-WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+WORDS = table_beside(__file__, "words.toml")
 _KEYS: dict[str, list[str]] = WORDS["keys"]
 # The unit of a column or of all numbers, as in "Height [nm]"; before a number it belongs to a length.
 _TITLED = re.compile(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation import Array, Facts, InputError
+from litho_data.foundation import Array, Facts, InputError, table_beside
 from litho_data.readers.reader import (
     DAMAGED,
     Channel,
@@ -26,37 +26,11 @@ from litho_data.readers.tiff import is_tiff, maker_of
 from litho_data.scan import Axis
 
 _HEAD_BYTES = 512
-# How files of formats with a signature start. Formats without a signature are left out, because any bytes of
-# the right length would pass as a map.
-_STARTS: dict[str, tuple[bytes, ...]] = {
-    "al3d": (b"AliconaImaging\0\r\n",),
-    "bcr": (b"fileformat = bcr", "fileformat = bcr".encode("utf-16-le"), "fileformat = bcr".encode("utf-16")),
-    "di": (b"\\*File list", b"?*File list"),
-    "ezd": (b"[DataSet]",),
-    "frt": (b"FRTM_GLIDERV",),
-    "mdt": (b"\x01\xb0\x93\xff",),
-    "metropro": (b"\x88\x1b\x03o", b"\x88\x1b\x03p", b"\x88\x1b\x03q"),
-    "mi": (b"fileType",),
-    "mnt": (b"\xd0\xcf\x11\xe0",),
-    "oir": (b"OLYMPUSRAWFORMAT",),
-    "opd": (b"\x01\0Directory",),
-    "opdx": (b"VCA DATA",),
-    "os3d": (b"OmniSurf3D",),
-    "sdf": (b"aISO-1.0", b"bISO-1.0"),
-    "sur": (b"DIGITAL SURF",),
-    "tmd": (b"Binary TrueMap Data File v2.0",),
-    "vk": (b"VK3_", b"VK4_", b"VK6", b"VK7"),
-    "wsxm": (b"WSxM file copyright",),
-    "zmg": (b"Zeta-Instruments",),
-    "zon": (b"KPK0", b"KPK1"),
+_FORMATS = table_beside(__file__, "formats.toml")
+_STARTS = {
+    kind: tuple(one.encode("latin-1") for one in starts) for kind, starts in _FORMATS["starts"].items()
 }
-_ZIP, _IN_ZIP = b"PK\x03\x04", ("x3p", "mitutoyo", "nmm", "plux", "poir", "qep")
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-# Formats of which the tests read no file.
-_UNTESTED = {
-    "datx", "frt", "lext", "mdt", "metropro", "mitutoyo", "nmm", "oir", "opdx", "os3d", "plux", "poir", "qep",
-    "vk", "zmg", "zon",
-}  # fmt: skip
+_ZIP, _HDF5 = b"PK\x03\x04", b"\x89HDF\r\n\x1a\n"
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
 # Digital Surf's kinds of studiables that are not one surface (series, layers, pictures, curves, spectra), and
@@ -92,7 +66,7 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
     elif head.startswith(_ZIP):
-        signed = _IN_ZIP
+        signed = tuple(_FORMATS["kinds"]["in_zip"])
     elif head.startswith(_HDF5):
         signed = ("datx",)
     elif _PLU.match(head):
@@ -174,7 +148,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
         notes=(f"read by SurfaceTopography as {kind}, which no test here covers",)
-        if kind in _UNTESTED
+        if kind in _FORMATS["kinds"]["untested"]
         else (),
     )
 

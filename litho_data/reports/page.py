@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from litho_data.foundation import Facts, atomic_file
+from litho_data.foundation import Facts, atomic_file, table_beside
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.reports.paper import wanted_format, write_figures
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # Column of a table to its title and meaning; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
-_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+_SPELT = table_beside(__file__, "words.toml")
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
 # Columns whose values are keys, which are spelt out like the names of columns.
