@@ -46,24 +46,19 @@ class PrintedField:
 
 
 @dataclass(frozen=True)
-class LeftAside:
-    """Unused files, of an id with only one file (``unpaired``) or of a refused id."""
-
-    id: str
-    files: tuple[Path, ...]
-    unpaired: bool
-    reason: str
-
-
-@dataclass(frozen=True)
 class Listing:
-    """A card, the folder of its files, the fields to build, and unused files with reasons."""
+    """A card, the folder of its files, the fields to build, and the files of every id.
+
+    ``unpaired`` (only one file) and ``refused`` map ids that are no fields to reasons.
+    """
 
     card: Card
     card_path: Path
     data_dir: Path
     fields: tuple[PrintedField, ...]
-    left_aside: tuple[LeftAside, ...]
+    files: Mapping[str, tuple[Path, ...]]
+    unpaired: Mapping[str, str]
+    refused: Mapping[str, str]
     assumptions: tuple[str, ...]
 
     def relative(self, path: Path) -> str:
@@ -91,29 +86,31 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
 
     fields: list[PrintedField] = []
-    aside: list[LeftAside] = []
+    every: dict[str, tuple[Path, ...]] = {}
+    unpaired: dict[str, str] = {}
+    refused: dict[str, str] = {}
     ids = sorted({*layouts, *scans, *table})
     print_ids = dict(zip(ids, prints_of(ids, card.ids.print), strict=True))
     for scan_id in ids:
         row = table.get(scan_id, {})
         use: Use = row.get("use", "dataset")
         files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
-        every = tuple(one for found in files for one in found)
+        every[scan_id] = tuple(one for found in files for one in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
-            aside.append(LeftAside(scan_id, every, True, f"no file {shown}"))
+            unpaired[scan_id] = f"no file {shown}"
             continue
         print_id = print_ids[scan_id]
         scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
-        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
+        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every[scan_id], folder)
         if not reason and (several := [found for found in files if len(found) > 1]):
             names = ", ".join(one.name for one in several[0])
             reason = f"several files: {names}; the pattern has to tell them apart"
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
-            aside.append(LeftAside(scan_id, every, False, reason))
+            refused[scan_id] = reason
             continue
         fields.append(
             PrintedField(
@@ -135,11 +132,12 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             wanted="period_um in that table, from its certificate",
         )
     if not any(one.use == "dataset" for one in fields):
-        shown = "; ".join(f"{one.id}: {one.reason}" for one in aside[:3]) or "no ids"
+        shown = "; ".join(f"{key}: {why}" for key, why in [*{**unpaired, **refused}.items()][:3]) or "no ids"
         raise InputError(
             f"card {file}: no field to build", got=shown, wanted="a layout and a scan with the same id"
         )
-    return Listing(card, file, folder, tuple(fields), tuple(aside), _assumptions(card, table))
+    assumed = _assumptions(card, table)
+    return Listing(card, file, folder, tuple(fields), every, unpaired, refused, assumed)
 
 
 def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:

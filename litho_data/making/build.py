@@ -89,19 +89,17 @@ def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> 
     if standards.described:
         # A bad standard spoils every scan, so it is reported once, before any scan is made.
         measure_scales(standards.described, list(standards.files.values()))
-    found = {one.id: [one.layout, one.scan] for one in listing.fields}
-    found |= {one.id: [*one.files] for one in listing.left_aside}
     return Source(
         card=listing.card,
         jobs=jobs,
         data_dir=listing.data_dir,
         standards=standards.files,
-        files={key: {listing.relative(path): path for path in paths if path} for key, paths in found.items()},
+        files={key: {listing.relative(one): one for one in paths} for key, paths in listing.files.items()},
         recipe=recipe,
         seed=seed,
         assumptions=listing.assumptions,
-        unpaired={one.id: one.reason for one in listing.left_aside if one.unpaired},
-        refused={one.id: one.reason for one in listing.left_aside if not one.unpaired},
+        unpaired=listing.unpaired,
+        refused=listing.refused,
     )
 
 

@@ -45,9 +45,7 @@ def read_channels(path: Path) -> list[Channel]:
         InputError: damaged file.
     """
     with open_tiff(path) as file:
-        pages: list[tuple[int, Any]] = [
-            (k, page) for k, page in enumerate(file.pages) if not _is_reduced(page)
-        ]
+        pages: list[tuple[int, Any]] = [(k, page) for k, page in enumerate(file.pages) if not page.is_reduced]
         imagej, ome = file.imagej_metadata or {}, file.ome_metadata or ""
         pitches = _ome_pitches_um(ome, len(pages))
         return [
@@ -112,10 +110,6 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: 
         header={str(key): str(value) for key, value in imagej.items()}
         | ({"ImageDescription": str(page.description)} if page.description else {}),
     )
-
-
-def _is_reduced(page: Any) -> bool:
-    return bool(page.is_reduced)
 
 
 def _may_hold_heights(tag: Any, shape: Shape) -> bool:

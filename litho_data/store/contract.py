@@ -128,11 +128,6 @@ def _chunks(document: Facts) -> Iterator[str]:
         yield between.join(numbers) or "0"
 
 
-def _by_xarray(attributes: Facts) -> bool:
-    """Whether xarray wrote this array of booleans: it stores them as small integers and says so."""
-    return attributes.get("dtype") == "bool"
-
-
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
     """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
     attributes = dict(root.attrs)
@@ -165,7 +160,8 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        as_integers = variable.dtype == "bool" and _by_xarray(array.attrs)
+        # xarray stores booleans as small integers, and says so.
+        as_integers = variable.dtype == array.attrs.get("dtype") == "bool"
         if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
