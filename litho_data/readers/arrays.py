@@ -42,6 +42,9 @@ _DIMENSIONS = ("_ARRAY_DIMENSIONS", "axes")
 _NO_COORDINATE = b"This is a netCDF dimension but not"
 
 
+Read = Callable[[], Array]
+
+
 @dataclass(frozen=True)
 class Coordinate:
     """Positions along one dimension and the unit that the file states, or a stated length alone.
@@ -80,7 +83,7 @@ class Held:
 
     dtype: np.dtype
     shape: Shape
-    read: Callable[[], Array]
+    read: Read
     attributes: Facts = field(default_factory=dict)
     dims: tuple[str, ...] = ("", "")
     coordinates: Mapping[str, Coordinate] = field(default_factory=dict)
@@ -182,7 +185,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _values(raw: Callable[[], Array], says: Facts, turned: bool, mirrored: bool) -> Loaded:
+def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
     """Mark missing pixels in the file's own numbers, then apply scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -264,7 +267,7 @@ def _hdf5_array(path: Path, item: Any, matlab: bool) -> Held:
         group = group.parent
     around = {**group.attrs, **around}
     attributes = {key: value for key, value in item.attrs.items() if key not in _OF_DIMENSIONS}
-    read = partial(_dataset, path, item.name)
+    read = partial(dataset, path, item.name)
     return Held(item.dtype, item.shape, read, attributes, tuple(dims), along or lines, around)
 
 
@@ -277,7 +280,8 @@ def _size(array: Any) -> int:
     return int(np.prod(array.shape))
 
 
-def _dataset(path: Path, name: str) -> Array:
+def dataset(path: Path, name: str) -> Array:
+    """The values of a dataset in an HDF5 file."""
     import h5py
 
     with h5py.File(path) as file:

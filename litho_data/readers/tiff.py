@@ -45,7 +45,9 @@ def read_channels(path: Path) -> list[Channel]:
         InputError: damaged file.
     """
     with open_tiff(path) as file:
-        pages: list[tuple[int, Any]] = [(k, page) for k, page in enumerate(file.pages) if not page.is_reduced]
+        pages: list[tuple[int, Any]] = [
+            (k, page) for k, page in enumerate(file.pages) if not getattr(page, "is_reduced", False)
+        ]
         imagej, ome = file.imagej_metadata or {}, file.ome_metadata or ""
         pitches = _ome_pitches_um(ome, len(pages))
         return [
