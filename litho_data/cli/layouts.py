@@ -110,7 +110,6 @@ def simulate(
     references: Annotated[
         bool, option("add scans of a bare substrate, a flat and a 5-step print", "--references")
     ] = False,
-    metadata: Annotated[str, option("full, or files-only (no order, positions, write axis)")] = "full",
     list_knobs: Annotated[
         bool,
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
@@ -165,7 +164,6 @@ def simulate(
         seed=seed,
         write_field_um=write_field_um,
         references=references,
-        metadata=metadata,
         jobs=jobs_of_card(layouts, printer=printer) if layouts is not None else None,
     )
     typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
