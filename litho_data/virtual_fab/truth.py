@@ -64,7 +64,7 @@ class ScanTruth(Record):
 class Truth(Result):
     """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid. ``settings``: further settings of the run; None in older files.
+    Both are heights in µm on the layout grid. ``settings``: further settings of the run.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -75,7 +75,7 @@ class Truth(Result):
     microscope: Microscope
     noise: Noise
     knobs: list[KnobTruth]
-    settings: dict[str, Any] | None = None
+    settings: dict[str, Any]
     scans: list[ScanTruth]
 
 
