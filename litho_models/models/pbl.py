@@ -8,6 +8,7 @@ network (shrinkage), areawise network (everything else).
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self, cast
 
@@ -16,7 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.layers.gaussian import Edge, Sigma, Support, gaussian_blur, supported_radius_px
+from litho_models.layers.gaussian import Edge, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
@@ -32,7 +33,7 @@ Channels = Annotated[int, Field(ge=1, le=1024)]
 
 
 class PblConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         "sigma_optical_um",
         "sigma_diffusion_max_um",
         "sigma_diffusion_init_um",
@@ -188,8 +189,9 @@ class Pbl(Simulator):
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
         """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
         optical, diffusion = self._radii_px()
-        initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
-        dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
+        blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
+        initial = self._threshold(blur(layout_um, self.config.sigma_optical_um, radius_px=optical))
+        dose = blur(initial, self.sigma_diffusion_um, radius_px=diffusion)
         if edge is None:
             return self._develop(crop_border(initial, diffusion), dose)
         return self._develop(initial, dose, padding=1)
@@ -201,9 +203,6 @@ class Pbl(Simulator):
             for sigma in (config.sigma_optical_um, diffusion)
         )
         return optical, diffused
-
-    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
-        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um

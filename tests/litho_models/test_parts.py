@@ -183,7 +183,7 @@ def test_every_part_states_its_source_and_numbers_within_their_range() -> None:
 def test_a_part_of_ones_own_is_a_stage_of_a_printer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
     numbers = {"gain": Number(0.5)}
-    register_part(Part("gain", "transfer", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
+    register_part(Part("gain", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
     model = printer("laser-writer", parts=("spot", "gain"))
     assert set(model.values) == {"spot.sigma_um", "gain.gain"}
     flat = torch.full((1, 1, 40, 40), 0.8)
