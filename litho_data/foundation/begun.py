@@ -15,13 +15,13 @@ result.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from litho_data.foundation.files import atomic_folder, clear_leftovers, locked, writable
+from litho_data.foundation.kinds import Facts
 from litho_data.foundation.outputs import (
     read_record,
     require_own_folder,
@@ -42,7 +42,7 @@ class Begun:
 
 @contextmanager
 def growing_folder(
-    out: str | Path, record: str, facts: Mapping[str, Any] | None = None, *, holds: str = ""
+    out: str | Path, record: str, facts: Facts | None = None, *, holds: str = ""
 ) -> Iterator[Begun]:
     """Yield a folder whose files appear as they are finished, so that a stopped run can resume.
 
@@ -86,7 +86,7 @@ def growing_folder(
 
 @contextmanager
 def whole_folder(
-    out: str | Path, *holds: str, record: str = "", facts: Mapping[str, Any] | None = None
+    out: str | Path, *holds: str, record: str = "", facts: Facts | None = None
 ) -> Iterator[Path]:
     """Yield a folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
 
@@ -105,7 +105,7 @@ def whole_folder(
         yield folder
 
 
-def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str) -> bool:
+def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
     """Return whether the folder contains an unfinished start of the same result."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record

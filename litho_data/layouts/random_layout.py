@@ -4,8 +4,7 @@ layout".
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
 
 PASSBANDS = ("square", "round")
 QUANTISERS = ("round", "floor")

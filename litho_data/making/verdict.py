@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
 from litho_data.cards.card import Card
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
@@ -82,7 +81,7 @@ def require_heights(prints: Sequence[Print], card: Card) -> None:
 
 
 def findings(
-    records: Sequence[Mapping[str, Any]],
+    records: Sequence[Facts],
     prints: Sequence[Print],
     doubts: Mapping[str, str],
     skipped: Mapping[str, str],
@@ -109,7 +108,7 @@ def findings(
     return sorted(found, key=lambda one: (one.weight, one.scan != ALL, one.scan))
 
 
-def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
+def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
     """Yield what is wrong with one scan; ``spread_nm`` contains the standard deviation of the heights by
     id.
     """
@@ -130,7 +129,7 @@ def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Ite
 
 
 def _of_the_card(
-    records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
+    records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
     """Yield the numbers of the card that the scans together contradict: one scan or all, the text, and the
     weight.
@@ -170,7 +169,7 @@ def _of_the_card(
         yield ALL, text, Weight.HEIGHT
 
 
-def _scale(record: Mapping[str, Any]) -> float:
+def _scale(record: Facts) -> float:
     """Return the scale factor of a scan onto its layout; 0 if it was not registered."""
     low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
     return float(low * high) ** 0.5 if low * high > 0 else 0.0

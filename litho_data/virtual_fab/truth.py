@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.level import level_polynomial
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
@@ -67,8 +67,7 @@ class Truth(Result):
     """The record `truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as
     ``surfaces/<id>.npy``.
 
-    Both files contain heights in µm on the layout grid. ``settings`` contains further settings of the run;
-    None in older files.
+    Both are heights in µm on the layout grid. ``settings`` contains further settings of the run.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -79,7 +78,7 @@ class Truth(Result):
     microscope: Microscope
     noise: Noise
     knobs: list[KnobTruth]
-    settings: dict[str, Any] | None = None
+    settings: dict[str, Any]
     scans: list[ScanTruth]
 
 
