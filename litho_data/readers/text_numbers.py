@@ -30,7 +30,7 @@ class Table:
 
 
 def numbers_of(block: Block) -> Table:
-    """Convert a block to numbers; ``nan`` and words are NaN, and an empty cell is the word "".
+    """Convert a block to numbers; ``nan`` and words become NaN; an empty cell counts as the word "".
 
     A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
 

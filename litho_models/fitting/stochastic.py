@@ -118,7 +118,7 @@ class _Targets:
     """The layouts of the training scans, and their heights without scan terms; unmeasured pixels have no
     weight.
 
-    Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
+    Around each scan the outermost pixels of its layout continue for ``overhang_px``; their weight is zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
