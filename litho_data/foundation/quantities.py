@@ -34,7 +34,7 @@ class Range:
         """Refuse values that are not numbers or are out of range.
 
         Raises:
-            InputError: shows the first such value.
+            InputError: the message shows the first such value.
         """
         wrong = [one for one in np.ravel(np.asarray(values, dtype=object)) if not self.holds(one)]
         if wrong:

@@ -26,7 +26,7 @@ class StoredScans:
         """Read the scans.
 
         Raises:
-            InputError: no store at the path, or one of another dataset.
+            InputError: no store at the path, or a store of another dataset.
         """
         store = open_store(self.path)
         if store.sha256 != self.sha256:

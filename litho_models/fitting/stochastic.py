@@ -47,7 +47,7 @@ def train_network(
 
     The best round is the one with the smallest error on ``validation``; without validation scans it is the
     last. ``first_predictions_um`` computes the heights of a small model on the training scans, from which the
-    first scan terms are estimated. A continued run does not need them.
+    first scan terms are estimated. A continued run needs no first predictions.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
