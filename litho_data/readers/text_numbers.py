@@ -84,7 +84,7 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
             for line, row in enumerate(tight.split("\n"), start=first_line):
                 if "," in row and _OTHER_SEPARATOR.search(row.strip()):
                     got = repr(row.strip()[:_SHOWN_CHARACTERS])
-                    wanted = "cells with one separator, and no marks of thousands"
+                    wanted = "cells with one separator, and no thousands separators"
                     raise InputError(f"line {line}", got=got, wanted=wanted)
         else:
             parts = _AT_COMMA.findall(text)
