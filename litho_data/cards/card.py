@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import parsed
 from litho_data.foundation.names import PlainName
-from litho_data.foundation.quantities import LENGTH_UM
+from litho_data.foundation.quantities import LENGTH_UM, Levels
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
@@ -129,7 +129,7 @@ class LayoutFiles(Record):
     files: FilePatterns
     pitch_um: Length
     level_height_um: Length
-    levels: int = Field(ge=2, le=256)
+    levels: Levels
     grey_per_level: Length | None = None
     average_px: int | None = Field(default=None, ge=2, le=15)
 

@@ -167,7 +167,9 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
         as_integers = variable.dtype == "bool" and _by_xarray(array.attrs)
-        if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
+        if array.shape != wanted or (
+            str(array.dtype) not in (variable.dtype, variable.wider) and not as_integers
+        ):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
         dims: Any = array.metadata.to_dict()["dimension_names"]

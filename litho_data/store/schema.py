@@ -18,22 +18,30 @@ WRITE = "write_"
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name."""
+    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name.
+
+    ``wider``: the type where ``dtype`` does not hold all values.
+    """
 
     name: str
     dims: tuple[str, ...]
     dtype: str
     unit: str
     long_name: str
+    wider: str = ""
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
         """The dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
+    def stored_as(self, sample: Array) -> str:
+        """The type in the store of values like these."""
+        return self.wider if str(sample.dtype) == self.wider else self.dtype
+
     def sample_sha256(self, sample: Array) -> str:
         """Hash of one scan's slice in its true shape, so padding and chunking do not matter."""
-        return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
+        return array_sha256(np.asarray(sample, dtype=self.stored_as(sample)), self.unit, self.sample_dims)
 
 
 class DatasetId(Record):
@@ -44,7 +52,8 @@ class DatasetId(Record):
 
 
 SAMPLE_VARIABLES = (
-    Variable("mask_level", ("scan", "y", "x"), "uint8", "1", "layout level sent to the printer"),
+    Variable("mask_level", ("scan", "y", "x"), "uint8", "1", "layout level sent to the printer",
+             wider="uint16"),
     Variable("height_um", ("scan", "y", "x"), "float32", "um", "levelled, registered height, layout grid"),
     Variable("valid", ("scan", "y", "x"), "bool", "1", "measured and inside the scan"),
     Variable("scan_to_layout", ("scan", "row", "column"), "float64", "1",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from scipy.signal import fftconvolve
 
 from litho_data.foundation.errors import InputError
+from litho_data.layouts.random_layout import random_layout
 from litho_models import load_frozen
 from litho_models.cli.app import main
 from litho_models.fitting.small_models import fit_small_model
@@ -190,6 +192,43 @@ def test_a_part_of_ones_own_is_a_stage_of_a_printer(monkeypatch: pytest.MonkeyPa
     assert torch.allclose(model(flat), torch.full_like(flat, 0.4))
     with pytest.raises(InputError, match="not taken"):
         register_part(PARTS["etch"])
+
+
+def test_pbl_begins_as_the_image_of_any_illumination() -> None:
+    layout = 0.1 * torch.from_numpy(random_layout((64, 64))[None, None]).float()
+    own = {"sigma_diffusion_init_um": 0.1, "surroundings": None, "scan_axis": None}
+    plain, spot = (build_model("pbl", **own, **more) for more in ({}, {"illumination": "spot"}))
+    spot.load_state_dict(plain.state_dict())
+    torch.testing.assert_close(plain(layout), spot(layout), rtol=0, atol=1e-5)
+    numbers = {"na": 0.5, "wavelength_um": 0.4, "kernels": 3}
+    pbl = build_model("pbl", illumination="lens", numbers=numbers, **own)
+    bare = build_model(
+        "projection", parts=("lens",), **{f"lens.{key}": value for key, value in numbers.items()}
+    )
+    torch.testing.assert_close(pbl(layout), bare(layout), rtol=0, atol=1e-5)
+    for wrong in ({"illumination": "etch"}, {"illumination": "lens", "numbers": {"sigma_um": 1}}):
+        with pytest.raises(InputError, match=r"illumination|sigma_um"):
+            build_model("pbl", **wrong)
+
+
+def test_a_contrast_curve_of_256_levels_is_fitted_by_33_heights() -> None:
+    geometry = {"pitch_um": 0.1, "levels": 256, "level_height_um": 1.2 / 255}
+    true = printer("laser-writer", **geometry)
+    scans = []
+    for number, scan in enumerate(make_scans(3, 64)):
+        level = random_layout((64, 64), levels=256, cutoff_per_um=0.5, seed=number)
+        scan = replace(scan, mask_level=level, levels=256, level_height_um=geometry["level_height_um"])
+        height = true(torch.from_numpy(scan.layout_um)[None, None])[0, 0].detach().numpy()
+        scans.append(replace(scan, height_um=height))
+    table = build_model("blur-table", **geometry)
+    assert table.parameter_count == 1 + 33
+    fit_small_model(table, scans, "none")
+    held_out = torch.from_numpy(
+        random_layout((64, 64), levels=256, cutoff_per_um=0.5, seed=9) * np.float32(1.2 / 255)
+    )
+    off = (table(held_out[None, None]) - true(held_out[None, None])).detach().abs()
+    # Between 33 heights lines cut the corners of the curve, which are rounded over a twentieth of the range.
+    assert float(off.mean()) < 0.004 * 1.2
 
 
 def test_a_fixed_number_stays_and_a_freed_one_does_not() -> None:
