@@ -145,8 +145,9 @@ class LayoutFiles(Record):
 class ScanFiles(Record):
     """The scan files. ``size_um`` is (y, x), for formats that do not carry it.
 
-    ``instrument``: the kind of microscope. The files of ``sem``, a scanning electron microscope, are pictures
-    of a film of the layout's full height; the build measures the edges of the film.
+    ``instrument``: the kind of microscope. A ``confocal`` one has no tip. The files of ``sem``, a scanning
+    electron microscope, are pictures of a film of the layout's full height; the build measures the edges of
+    the film.
 
     ``levelled``: whether the build takes the heights from the files without levelling them.
     ``missing``: numbers and words that mark pixels without a measurement; an empty list says that there are
@@ -284,6 +285,8 @@ class Card(Record):
         heights = (self.process.level, self.process.tip, self.calibration, self.grating)
         if self.scan.instrument == "sem" and any(one is not None for one in heights):
             raise ValueError("wanted no levelling, tip, calibration or grating: micrographs have none")
+        if self.scan.instrument == "confocal" and self.process.tip is not None:
+            raise ValueError("wanted no tip: a confocal microscope has none")
         return self
 
 

@@ -98,9 +98,9 @@ OPTIONAL_COLUMNS = {
     "pixel_size": Range(1e-3, 1e3),
 }
 """Numbers per scan from the card's table with their ranges; coordinates, NaN where a row has none."""
-Instrument = Literal["afm", "sem"]
-"""What heights are: measured by an atomic force microscope (``afm``), or a film's height times its coverage
-of a pixel, from the edges in an electron micrograph (``sem``)."""
+Instrument = Literal["afm", "profilometer", "confocal", "sem"]
+"""What heights are: measured by a probe (``afm``, ``profilometer``), by light (``confocal``), or a film's
+height times its coverage of a pixel, from the edges in an electron micrograph (``sem``)."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -20,7 +20,8 @@ from litho_models.scoring.statistics import OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
-LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+LEADING: dict[Instrument, str] = dict.fromkeys(get_args(Instrument), "mae_datum_free_nm")
+LEADING["sem"] = "edge_mean_nm"
 """The error by which models are ranked and compared, by the instrument."""
 
 
