@@ -24,7 +24,8 @@ from litho_data.making.build import build_dataset
 from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, simulate_films
 from litho_models.loop.run import close_loop
 
-COUNT, SIZE_PX = 12, 192
+# Two of the films are locked, and eight at least have to remain to confirm anything.
+COUNT, SIZE_PX = 16, 208
 EFFECTS = {
     "backscatter": "electron-backscatter",
     "diffusion_um": "resist-diffusion",

@@ -19,7 +19,7 @@ from litho_data.layouts.random_layout import random_layout
 from litho_models import load_frozen
 from litho_models.cli.app import main
 from litho_models.fitting.small_models import fit_small_model
-from litho_models.models import MODELS, build_model, fixed_numbers
+from litho_models.models import MODELS, build_model, fixed_numbers, kernels_part
 from litho_models.models.hopkins import Optics, imaged, intensity, kernel_reach_px, transfer_functions
 from litho_models.models.parts import PARTS, Number, Part, contrast_curve, register_part
 from litho_models.models.printers import Printer
@@ -141,6 +141,48 @@ def test_a_field_is_imaged_as_its_part_is_and_an_open_mask_is_bright() -> None:
     assert whole.shape[-2:] == (40, 30)
     assert torch.allclose(whole[..., 10:, :-4], part, atol=1e-5)
     assert torch.allclose(intensity(torch.ones_like(mask), lens, PITCH_UM), torch.ones(40, 30), atol=1e-5)
+
+
+def test_kernels_in_a_file_image_as_the_lens_they_come_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
+    lens = LENS._replace(kernels=5)
+    size = 2 * kernel_reach_px(lens, PITCH_UM) + 1
+    kernels = np.fft.fftshift(np.fft.ifft2(transfer_functions(lens, PITCH_UM, (size, size))), axes=(-2, -1))
+    np.save(tmp_path / "kernels.npy", kernels)
+    register_part(kernels_part("own-lens", tmp_path / "kernels.npy"))
+    numbers = {f"lens.{name}": value for name, value in lens._asdict().items()}
+    layout = 0.1 * torch.from_numpy(random_layout((60, 50), pitch_um=PITCH_UM)[None, None]).float()
+    own, known = (
+        build_model("projection", pitch_um=PITCH_UM, **parts)(layout)
+        for parts in ({"parts": ("own-lens",)}, {"parts": ("lens",), **numbers})
+    )
+    torch.testing.assert_close(own, known, rtol=0, atol=1e-5)
+    np.save(tmp_path / "even.npy", kernels[:, 1:, 1:])
+    for file, said in {"even.npy": "odd", "none.npy": "no such file"}.items():
+        with pytest.raises(InputError, match=said):
+            kernels_part("wrong", tmp_path / file)
+
+
+def test_physics_is_a_printer_of_spot_threshold_shrinkage_and_transfer() -> None:
+    physics = build_model("physics", sigma_diffusion_init_um=0.7, gain_init=0.9, kappa_min_init=0.3)
+    values = {name: float(value) for name, value in physics.values.items()}
+    assert values["bias_um"] == 0
+    parts = printer(
+        "laser-writer",
+        parts=("spot", "tanh", "shrinkage", "transfer"),
+        **{
+            "spot.sigma_um": physics.config.sigma_optical_um,
+            "tanh.contrast": values["alpha"],
+            "tanh.threshold": values["eta"],
+            "shrinkage.sigma_um": values["sigma_diffusion_um"],
+            "shrinkage.kappa_min": values["kappa_min"],
+            "transfer.selectivity": values["gain"],
+        },
+    )
+    layout = 0.1 * torch.from_numpy(random_layout((64, 64))[None, None]).float()
+    torch.testing.assert_close(parts(layout), physics(layout), rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow
