@@ -18,6 +18,7 @@ import torch
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, options, origin
 from benchmarks.second_machine import PAGE
+from benchmarks.second_machine import RESULT as MACHINE
 from litho_data.commands.progress import run_script
 from litho_data.reports.pictures import new_figure
 from litho_data.store import open_store
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
     from litho_data.store import PrintedScan
 
-RESULT = PAGE.parent / "results" / "second-machine" / "film_design.json"
+RESULT = MACHINE.with_name("film_design.json")
 PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
 DESIGNER, JUDGE = "e-beam", "random-features"
 # Beyond the design nothing is written, which the pattern does not say of its surroundings.

@@ -153,7 +153,10 @@ def test_kernels_in_a_file_image_as_the_lens_they_come_from(
     np.save(tmp_path / "kernels.npy", kernels)
     register_part(kernels_part("own-lens", tmp_path / "kernels.npy"))
     numbers = {f"lens.{name}": value for name, value in lens._asdict().items()}
-    layout = 0.1 * torch.from_numpy(random_layout((60, 50), pitch_um=PITCH_UM)[None, None]).float()
+    layout = (
+        0.1
+        * torch.from_numpy(random_layout((60, 50), cutoff_per_um=1.0, pitch_um=PITCH_UM)[None, None]).float()
+    )
     own, known = (
         build_model("projection", pitch_um=PITCH_UM, **parts)(layout)
         for parts in ({"parts": ("own-lens",)}, {"parts": ("lens",), **numbers})
