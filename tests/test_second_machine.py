@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
+from benchmarks import film_design, film_trials
 from benchmarks.record import published
 from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, made, started, text_of
 from litho_models.models.printers import Printer
+from tests.litho_models.prints import make_scan
 
 GEOMETRY: dict[str, Any] = {"pitch_um": 0.004, "levels": 17, "level_height_um": 0.01375}
 
@@ -37,6 +42,34 @@ def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
     assert not models[0].raw_etch__bias_px.requires_grad
 
 
-def test_the_page_shows_the_record() -> None:
-    record = json.loads(RESULT.read_text(encoding="utf-8"))
-    assert published(PAGE, "second machine") == text_of(record)
+def test_a_print_is_off_by_what_its_edges_are_displaced() -> None:
+    scan = make_scan(0, 128)
+    wanted = np.zeros((128, 128), np.float32)
+    wanted[40:90, 40:90] = (scan.levels - 1) * scan.level_height_um
+    # All four edges of a square are a pixel off, less at its rounded corners.
+    smaller = binary_erosion(wanted > 0) * wanted.max()
+    for printed, pixels in ((wanted, 0.0), (smaller, 1.0)):
+        found = film_design.judged(wanted, printed, scan)
+        assert found["edge_mean_nm"] == pytest.approx(1e3 * scan.pitch_um * pixels, rel=0.03)
+        assert (found["missing"], found["extra"], found["merged"]) == (0, 0, 0)
+    assert film_design.judged(wanted, 0 * wanted, scan)["missing"] == 1
+
+
+def test_the_settings_of_a_film_are_those_of_its_store() -> None:
+    scan = make_scan(0, 128)
+    layout = film_design.settings_for(scan, 64).layout
+    assert (layout.pitch_um, layout.cell_um, layout.levels) == (scan.pitch_um, scan.pitch_um, scan.levels)
+    assert film_design.middle(scan.layout_um, 64).shape == (64, 64)
+
+
+@pytest.mark.parametrize(
+    ("name", "result", "text"),
+    [
+        ("second machine", RESULT, text_of),
+        ("film design", film_design.RESULT, film_design.text_of),
+        ("film trials", film_trials.RESULT, film_trials.text_of),
+    ],
+)
+def test_the_page_shows_the_record(name: str, result: Path, text: Callable[[Any], str]) -> None:
+    record = json.loads(result.read_text(encoding="utf-8"))
+    assert published(PAGE, name) == text(record)
