@@ -9,6 +9,7 @@ features judge: their training shares the micrographs, but no formula.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ import torch
 
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, options, origin
-from benchmarks.second_machine import PAGE
+from benchmarks.second_machine import PAGE, judged
 from benchmarks.second_machine import RESULT as MACHINE
 from litho_data.commands.progress import run_script
 from litho_data.reports.pictures import new_figure
@@ -27,8 +28,6 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import load_printer
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 from litho_models import freeze, train
-from litho_models.scoring.films import film_errors
-from litho_models.scoring.shapes import FILM_SEARCH_PX, edge_placement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,13 +50,13 @@ def main() -> None:
     torch.set_num_threads(1)
     scan = open_store(given.store).scan(PATTERN)
     settings = settings_for(scan)
-    wanted_um = middle(scan.layout_um, SIZE_PX)
+    film = wanted_film(scan)
     printers = {name: printer(name, given.store, given.cache, settings) for name in (DESIGNER, JUDGE)}
     out = given.cache / "design"
     if not (out / "design.json").is_file():
-        correct(wanted_um, printers[DESIGNER], out, settings=settings, robust=False, announce=False)
+        correct(film.height_um, printers[DESIGNER], out, settings=settings, robust=False, announce=False)
     layouts = {
-        "uncorrected": wanted_um,
+        "uncorrected": film.height_um,
         "corrected": load_design(out).level.numpy() * np.float32(scan.level_height_um),
     }
     prints = {
@@ -71,12 +70,11 @@ def main() -> None:
         "size_px": SIZE_PX,
         "pitch_um": scan.pitch_um,
         "rows": [
-            {"model": name, "layout": kind, **judged(wanted_um, one, scan)}
-            for (name, kind), one in prints.items()
+            {"model": name, "layout": kind, **judged(film, one)} for (name, kind), one in prints.items()
         ],
     }
     if given.publish:
-        figure = drawn(wanted_um, layouts["corrected"], {kind: prints[JUDGE, kind] for kind in layouts})
+        figure = drawn(film.height_um, layouts["corrected"], {kind: prints[JUDGE, kind] for kind in layouts})
         figure.savefig(given.out.with_name("design.png"), dpi=110)
     conclude(record, text_of(record), given.out, PAGE, "film design", published=given.publish)
 
@@ -89,10 +87,13 @@ def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
     return relief_settings({**changes, "search.polish_rounds": POLISH})
 
 
-def middle(field: np.ndarray, size_px: int) -> np.ndarray:
-    """The middle square of a field."""
-    top, left = ((length - size_px) // 2 for length in field.shape)
-    return field[top : top + size_px, left : left + size_px]
+def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
+    """The middle square of the layout as the film that is to be printed; its rim is not scored."""
+    top, left = ((length - size_px) // 2 for length in scan.shape)
+    level = scan.mask_level[top : top + size_px, left : left + size_px]
+    inner = np.pad(np.ones([size_px - 2 * RIM_PX] * 2, bool), RIM_PX)
+    film = replace(scan, mask_level=level, valid=inner, height_sigma_um=None)
+    return replace(film, height_um=film.layout_um)
 
 
 def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Printer:
@@ -109,18 +110,6 @@ def printed(by: Printer, layout_um: np.ndarray, settings: ReliefSettings) -> np.
     """Predicted height (y, x), µm, of a layout in heights."""
     levels = torch.from_numpy(layout_um / np.float32(settings.layout.level_height_um))
     return by(levels[None, None])[0, 0].numpy()
-
-
-def judged(wanted_um: np.ndarray, printed_um: np.ndarray, scan: PrintedScan) -> dict[str, Any]:
-    """Edges and features of a print against the film that is wanted, without the rim."""
-    inner = np.full(wanted_um.shape, np.nan)
-    cut = (slice(RIM_PX, -RIM_PX),) * 2
-    inner[cut] = wanted_um[cut]
-    edge_um = (scan.levels - 1) * scan.level_height_um / 2
-    heights_um, search_um = np.array([edge_um]), FILM_SEARCH_PX * scan.pitch_um
-    edges = edge_placement(inner, printed_um, heights_um, scan.pitch_um, search_um)
-    films = film_errors(inner, printed_um, edge_um)
-    return {"edge_mean_nm": edges.mean_nm, "edge_p95_nm": edges.p95_nm, **films._asdict()}
 
 
 def text_of(record: Mapping[str, Any]) -> str:

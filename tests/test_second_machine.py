@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy.ndimage import binary_erosion
 
 from benchmarks import film_design, film_trials
 from benchmarks.record import published
-from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, made, started, text_of
+from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, judged, made, started, text_of
 from litho_models.models.printers import Printer
 from tests.litho_models.prints import make_scan
 
@@ -43,23 +44,19 @@ def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
 
 
 def test_a_print_is_off_by_what_its_edges_are_displaced() -> None:
-    scan = make_scan(0, 128)
-    wanted = np.zeros((128, 128), np.float32)
-    wanted[40:90, 40:90] = (scan.levels - 1) * scan.level_height_um
+    scan = replace(make_scan(0, 128), seen_by="sem")
+    level = np.zeros((128, 128), np.uint8)
+    level[40:90, 40:90] = scan.levels - 1
+    film = film_design.wanted_film(replace(scan, mask_level=level), 112)
     # All four edges of a square are a pixel off, less at its rounded corners.
-    smaller = binary_erosion(wanted > 0) * wanted.max()
-    for printed, pixels in ((wanted, 0.0), (smaller, 1.0)):
-        found = film_design.judged(wanted, printed, scan)
+    smaller = binary_erosion(film.mask_level) * film.height_um.max()
+    for printed, pixels in ((film.height_um, 0.0), (smaller, 1.0)):
+        found = judged(film, printed)
         assert found["edge_mean_nm"] == pytest.approx(1e3 * scan.pitch_um * pixels, rel=0.03)
         assert (found["missing"], found["extra"], found["merged"]) == (0, 0, 0)
-    assert film_design.judged(wanted, 0 * wanted, scan)["missing"] == 1
-
-
-def test_the_settings_of_a_film_are_those_of_its_store() -> None:
-    scan = make_scan(0, 128)
+    assert judged(film, 0 * film.height_um)["missing"] == 1
     layout = film_design.settings_for(scan, 64).layout
     assert (layout.pitch_um, layout.cell_um, layout.levels) == (scan.pitch_um, scan.pitch_um, scan.levels)
-    assert film_design.middle(scan.layout_um, 64).shape == (64, 64)
 
 
 @pytest.mark.parametrize(
