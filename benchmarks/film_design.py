@@ -1,9 +1,9 @@
-"""A film corrected through the printer of parts of the second machine, and judged by another model.
+"""A film corrected through the printer of parts of the second machine, and judged by other models.
 
     python -m benchmarks.film_design prefab-soi.zarr [--publish]
 
-What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects, random
-features judge: their training shares the micrographs, but no formula.
+What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects. A blur with a
+table and random features judge; they share its micrographs, but no formula.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 RESULT = MACHINE.with_name("film_design.json")
 PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
-DESIGNER, JUDGE = "e-beam", "random-features"
+DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
 # Beyond the design nothing is written, which the pattern does not say of its surroundings.
 RIM_PX = 24
 
@@ -51,7 +51,7 @@ def main() -> None:
     scan = open_store(given.store).scan(PATTERN)
     settings = settings_for(scan)
     film = wanted_film(scan)
-    printers = {name: printer(name, given.store, given.cache, settings) for name in (DESIGNER, JUDGE)}
+    printers = {name: printer(name, given.store, given.cache, settings) for name in (DESIGNER, *JUDGES)}
     out = given.cache / "design"
     if not (out / "design.json").is_file():
         correct(film.height_um, printers[DESIGNER], out, settings=settings, robust=False, announce=False)
@@ -74,7 +74,8 @@ def main() -> None:
         ],
     }
     if given.publish:
-        figure = drawn(film.height_um, layouts["corrected"], {kind: prints[JUDGE, kind] for kind in layouts})
+        by_judge = {kind: prints[JUDGES[0], kind] for kind in layouts}
+        figure = drawn(film.height_um, layouts["corrected"], by_judge)
         figure.savefig(given.out.with_name("design.png"), dpi=110)
     conclude(record, text_of(record), given.out, PAGE, "film design", published=given.publish)
 
