@@ -2,8 +2,8 @@
 
     python -m benchmarks.film_design prefab-soi.zarr [--publish]
 
-What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects. A blur with a
-table and random features judge; they share its micrographs, but no formula.
+What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects, a blur
+with a table and random features judge. They share its micrographs, but no formula.
 """
 
 from __future__ import annotations
