@@ -174,17 +174,17 @@ def kernels_part(name: str, file: str | Path) -> Part:
     """
     with damaged(f"kernels {file}"):
         kernels = np.load(require_file(file), allow_pickle=False)
-    size_px = kernels.shape[-1]
-    square = kernels.ndim == 3 and kernels.shape[1] == size_px
-    if not square or size_px % 2 == 0 or not np.isfinite(kernels).all():
-        got = f"{kernels.dtype} {kernels.shape}"
-        raise InputError(f"kernels {file}", got=got, wanted="(k, size, size) of an odd size")
+        size_px = kernels.shape[-1]
+        odd = kernels.ndim == 3 and kernels.shape[1] == size_px and size_px % 2
+        if not odd or not np.isfinite(kernels).all():
+            got = f"{kernels.dtype} {kernels.shape}"
+            raise InputError(f"kernels {file}", got=got, wanted="numbers (k, size, size) of an odd size")
     spectra = lru_cache(maxsize=2)(partial(spectra_of, kernels))
 
     def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
         return imaged_inside(pattern, spectra(*pattern.shape[-2:]), size_px // 2)
 
-    return Part(name, "illumination", {}, apply, f"{Path(file).name}", lambda *_: size_px // 2)
+    return Part(name, "illumination", {}, apply, Path(file).name, lambda *_: size_px // 2)
 
 
 _SIGMA = {"sigma_um": Number(0.2, "µm")}
