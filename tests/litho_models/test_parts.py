@@ -170,7 +170,7 @@ def test_kernels_in_a_file_image_as_the_lens_they_come_from(
 
 def test_physics_is_a_printer_of_spot_threshold_shrinkage_and_transfer() -> None:
     physics = build_model("physics", sigma_diffusion_init_um=0.7, gain_init=0.9, kappa_min_init=0.3)
-    values = {name: float(value) for name, value in physics.values.items()}
+    values = {name: value.item() for name, value in physics.values.items()}
     assert values["bias_um"] == 0
     parts = printer(
         "laser-writer",
