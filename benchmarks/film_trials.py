@@ -27,8 +27,8 @@ from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, simulate_film
 from litho_models.loop.run import close_loop
 
 RESULT = MACHINE.with_name("film_trials.json")
-# Two of the films are locked, and eight at least have to remain to confirm anything.
-COUNT, SIZE_PX = 16, 208
+# Two films are locked, coarse ones may not register, and eight have to remain to confirm anything.
+COUNT, SIZE_PX = 18, 208
 EFFECTS = {
     "backscatter": "electron-backscatter",
     "diffusion_um": "resist-diffusion",
