@@ -1,27 +1,27 @@
 """Laws: short formulas of height, slopes, surroundings, position and order.
 
-A law is an effect with one strength (and the position of a jump), so the same code screens, fits, judges and
-applies it. It states how the height departs from the model, not why. Tables have many strengths; they follow
-any dependence on their covariate and explain nothing.
+A law is an effect with one strength and fitted shapes: a power, a length, a direction, a position. The same
+code screens, fits, judges and applies it. It states how the height departs from the model, not why. Tables
+have many strengths; they follow any dependence on their covariate and explain nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import Apply, Effect, FieldContext, Parameter, Values, of_development
+from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-_REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
-_RIM_UM = 2.0
+_RIM_UM, _BLURRED_UM = 2.0, 1.5
 # Over a micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
-_FREQUENCIES_PER_UM = tuple(0.5 * half for half in range(4, 21))
+_WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
+_FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
 _WORDS = ("x", "y", "r²", "rim")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
@@ -33,35 +33,34 @@ _COPIES_UM = {
 _LAST_KNOT = 16
 _KNOTS = [f"level_{knot}_of_{_LAST_KNOT}" for knot in range(_LAST_KNOT + 1)]
 _POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
-_TURN = "print and scan the same layouts turned by 90 degrees"
-_SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
-_DIAGONAL = 0.5**0.5
-# Directions of slopes, as (y, x).
-_DIRECTIONS = {
-    "x": (0.0, 1.0),
-    "y": (1.0, 0.0),
-    "diagonal": (_DIAGONAL, _DIAGONAL),
-    "antidiagonal": (_DIAGONAL, -_DIAGONAL),
-}
+_TURNED = "print and scan the same layouts turned by 90 degrees"
+_SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y", 1)}
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Quantities for formulas, from a height h (b, 1, y, x), µm, its field, and the law's parameters."""
+    """Quantities for formulas, from a field h (b, 1, y, x), µm, its context, and the law's parameters.
+
+    ``h``: the height, or, for a law of the exposure, the dose as nominal height.
+    """
 
     h: Tensor
     context: FieldContext
     values: Values
 
-    def slope(self, direction: str, of: Tensor | None = None) -> Tensor:
-        """Slope of a map (by default the height) along a direction, by central differences."""
-        along_y, along_x = _DIRECTIONS[direction]
-        y, x = gradient(self.h if of is None else of, self.context.pitch_um)
-        return along_y * y + along_x * x
+    def along(self, axis: str, y: Tensor, x: Tensor) -> Tensor:
+        """Component of a vector along an axis, turned from x towards y if the law has a turn."""
+        angle = torch.deg2rad(self.values.get("turn_deg", self.h.new_zeros(())))
+        sine, cosine = angle.sin(), angle.cos()
+        return cosine * x + sine * y if axis == "x" else cosine * y - sine * x
 
-    def size(self, power: float, *directions: str) -> Tensor:
-        """A power of the absolute slope along a direction, or of the steepness, smoothed near zero."""
-        squared = torch.stack([self.slope(one) for one in directions]).square().sum(dim=0)
+    def slope(self, axis: str, of: Tensor | None = None) -> Tensor:
+        """Slope of a map (by default the height) along an axis, by central differences."""
+        return self.along(axis, *gradient(self.h if of is None else of, self.context.pitch_um))
+
+    def size(self, *axes: str, power: float | Tensor = 1.0) -> Tensor:
+        """A power of the absolute slope along an axis, or of the steepness, smoothed near zero."""
+        squared = torch.stack([self.slope(one) for one in axes]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
@@ -81,31 +80,21 @@ class Surface:
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
-    def mean(self, reach_um: float, of: Tensor | None = None) -> Tensor:
-        """Gaussian-weighted local mean of a map, by default the height."""
-        field, variance_um2 = self.h if of is None else of, self.h.new_tensor(reach_um**2)
-        return add_blur(field, variance_um2, self.context.pitch_um, 4 * reach_um)
+    def mean(self, of: Tensor | None = None, reach_um: float | Tensor | None = None) -> Tensor:
+        """Gaussian-weighted local mean of a map, by default the height within the law's length."""
+        field = self.h if of is None else of
+        reach = torch.as_tensor(self.values["length_um"] if reach_um is None else reach_um).to(self.h)
+        return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
-    def beside(self, side: str, length_um: float) -> Tensor:
-        """Exponentially weighted mean height on one side, with the given decay length."""
-        axis, sign = _SIDES[side]
-        length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
-
-        def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            return trailing_response(-sign * (fx if axis == -1 else fy), length, pitch) - 1
-
-        return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
-
-    def along(self, direction: str, length_um: float) -> Tensor:
-        """Exponentially weighted mean height along a direction, to both sides."""
-        along_y, along_x = _DIRECTIONS[direction]
-        length, pitch = self.h.new_tensor(length_um), self.context.pitch_um
+    def trailing(self, *sides: str) -> Tensor:
+        """Exponentially weighted mean height on one side or both, decaying over the law's length."""
+        length, pitch = self.values["length_um"], self.context.pitch_um
 
         def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-            # The phases of both sides cancel.
-            return trailing_response(along_y * fy + along_x * fx, length, pitch).real - 1
+            ways = [-sign * self.along(axis, fy, fx) for axis, sign in (_SIDES[side] for side in sides)]
+            return torch.stack([trailing_response(way, length, pitch) for way in ways]).mean(dim=0) - 1
 
-        return add_filtered(self.h, transfer_minus_one, pitch, 6 * length_um)
+        return add_filtered(self.h, transfer_minus_one, pitch, 6 * float(length.detach()))
 
 
 # Computes the map (b, 1, y, x) that a strength multiplies.
@@ -114,30 +103,40 @@ Column = Callable[[Surface], Tensor]
 
 # Name, formula, unit of the column, column.
 Facts = tuple[str, str, str, Column]
+Families = tuple[tuple[Iterable[Facts], Mapping[str, Parameter]], ...]
+_POSITION = {
+    "position": Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
+}
+_POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 3.0))}
+_TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
+_REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
+_TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0))}
 
 
-def _columns() -> Iterator[Facts]:
-    for axis in _DIRECTIONS:
-        yield from (_power(axis, power) for power in (1.0, 1.5, 2.0, 3.0))
-        yield from _one_way(axis)
+def _fixed() -> Iterator[Facts]:
     for axis in ("x", "y"):
         yield from _along_axis(axis)
         yield from (_slope_at(axis, word) for word in _WORDS)
-    yield "steepness-power-1", "|∇h|", "1", lambda s: s.size(1, "x", "y")
-    yield "steepness-power-2", "|∇h|²", "1", lambda s: s.size(2, "x", "y")
     yield "height-power-2", "h²", "µm²", lambda s: s.h**2
     yield "height-power-3", "h³", "µm³", lambda s: s.h**3
     yield "height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order
     yield from (_height_at(word) for word in _WORDS)
-    yield from (_surroundings_at(word) for word in _WORDS)
-    for reach_um in _REACHES_UM:
-        yield from _nearby(reach_um)
-    yield from (_to_both_sides(axis, length_um) for axis in _DIRECTIONS for length_um in _TAILS_UM[1:])
-    yield from (_to_one_side(side, length_um) for side in _SIDES for length_um in _TAILS_UM)
+    yield from (_blurred_at(word) for word in _WORDS)
 
 
-def _power(axis: str, power: float) -> Facts:
-    return f"slope-{axis}-power-{power:g}", f"|∂h/∂{axis}|^{power:g}", "1", lambda s: s.size(power, axis)
+def _steepness() -> Iterator[Facts]:
+    yield "steepness-power", "|∇h|^power", "1", lambda s: s.size("x", "y", power=s.values["power"])
+
+
+def _nearby() -> Iterator[Facts]:
+    yield "surroundings", "h̄ - h", "µm", lambda s: s.mean() - s.h
+    yield "blur-height", "h (h̄ - h)", "µm²", lambda s: s.h * (s.mean() - s.h)
+    yield "above-surroundings", "(h - h̄)²", "µm²", lambda s: (s.h - s.mean()) ** 2
+    yield "steps-nearby", "mean of |∇h| within the length", "1", lambda s: s.mean(s.size("x", "y"))
+
+
+def _power(axis: str) -> Facts:
+    return f"slope-{axis}-power", f"|∂h/∂{axis}|^power", "1", lambda s: s.size(axis, power=s.values["power"])
 
 
 def _one_way(axis: str) -> Iterator[Facts]:
@@ -147,29 +146,28 @@ def _one_way(axis: str) -> Iterator[Facts]:
 
 def _along_axis(axis: str) -> Iterator[Facts]:
     yield f"height-times-slope-{axis}", f"h ∂h/∂{axis}", "µm", lambda s: s.h * s.slope(axis)
-    yield f"height-times-slope-size-{axis}", f"h |∂h/∂{axis}|", "µm", lambda s: s.h * s.size(1, axis)
+    yield f"height-times-slope-size-{axis}", f"h |∂h/∂{axis}|", "µm", lambda s: s.h * s.size(axis)
     yield f"curvature-{axis}", f"∂²h/∂{axis}²", "1/µm", lambda s: s.slope(axis, s.slope(axis))
     name = f"slope-size-{axis}-times-order"
-    yield name, f"|∂h/∂{axis}| t", "1", lambda s: s.size(1, axis) * s.context.order
+    yield name, f"|∂h/∂{axis}| t", "1", lambda s: s.size(axis) * s.context.order
 
 
 def _slope_at(axis: str, word: str) -> Facts:
     name = f"slope-size-{axis}-times-{word.replace('²', '2')}"
-    return name, f"|∂h/∂{axis}| {word}", "1", lambda s: s.size(1, axis) * s.place(word)
+    return name, f"|∂h/∂{axis}| {word}", "1", lambda s: s.size(axis) * s.place(word)
 
 
 def _height_at(word: str) -> Facts:
     return f"height-times-{word.replace('²', '2')}", f"h {word}", "µm", lambda s: s.h * s.place(word)
 
 
-def _surroundings_at(word: str) -> Facts:
-    reach_um = _REACHES_UM[1]
-    name, formula = f"blur-{word.replace('²', '2')}-{reach_um:g}-um", f"(h̄({reach_um:g} µm) - h) {word}"
-    return name, formula, "µm", lambda s: (s.mean(reach_um) - s.h) * s.place(word)
+def _blurred_at(word: str) -> Facts:
+    name, formula = f"blur-times-{word.replace('²', '2')}", f"(h̄({_BLURRED_UM} µm) - h) {word}"
+    return name, formula, "µm", lambda s: (s.mean(reach_um=_BLURRED_UM) - s.h) * s.place(word)
 
 
 def _jumps(axis: str) -> Iterator[Facts]:
-    name, formula = f"jump-along-{axis}", f"({axis} > {axis}0)"
+    name, formula = f"jump-along-{axis}", f"({axis} > position)"
     yield f"{name}-in-height", formula, "1", lambda s: s.beyond(axis)
     yield f"{name}-in-gain", f"h {formula}", "µm", lambda s: s.h * s.beyond(axis)
     yield from (_displaced(name, formula, axis, way) for way in ("x", "y"))
@@ -179,64 +177,63 @@ def _displaced(name: str, formula: str, axis: str, way: str) -> Facts:
     return f"{name}-in-{way}", f"∂h/∂{way} {formula}", "1", lambda s: s.slope(way) * s.beyond(axis)
 
 
-def _nearby(reach_um: float) -> Iterator[Facts]:
-    mean, within = f"h̄({reach_um:g} µm)", f"{reach_um:g}-um"
-    yield f"surroundings-{within}", f"{mean} - h", "µm", lambda s: s.mean(reach_um) - s.h
-    blurred = f"h ({mean} - h)"
-    yield f"blur-height-{within}", blurred, "µm²", lambda s: s.h * (s.mean(reach_um) - s.h)
-    yield f"above-surroundings-{within}", f"(h - {mean})²", "µm²", lambda s: (s.h - s.mean(reach_um)) ** 2
-    steps = f"mean of |∇h| within {reach_um:g} µm"
-    yield f"steps-within-{within}", steps, "1", lambda s: s.mean(reach_um, s.size(1, "x", "y"))
+def _beside(name: str, *sides: str) -> Facts:
+    formula = f"mean of D {' and '.join(sides)} over the length - D"
+    return name, formula, "µm", lambda s: s.trailing(*sides) - s.h
 
 
-def _to_both_sides(axis: str, length_um: float) -> Facts:
-    name, formula = f"along-{axis}-{length_um:g}-um", f"h along {axis} over {length_um:g} µm - h"
-    return name, formula, "µm", lambda s: s.along(axis, length_um) - s.h
-
-
-def _to_one_side(side: str, length_um: float) -> Facts:
-    name, formula = f"{side}-{length_um:g}-um", f"h {side} over {length_um:g} µm - h"
-    return name, formula, "µm", lambda s: s.beside(side, length_um) - s.h
-
-
-def _law(name: str, formula: str, unit: str, column: Column, **shapes: Parameter) -> Effect:
-    unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
-
-    def apply(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-        return height + values["strength"] * column(Surface(height, context, values))
-
-    return Effect(
-        # The name may become part of a parameter's name.
-        name=name.replace(".", "-"),
-        title=f"height changed by {formula}",
-        stage="development",
-        role="undetermined",
-        acts_on="height",
-        parameters={"strength": Parameter(unit_of_strength[unit], -2.0, 2.0, 0.05), **shapes},
-        apply=apply,
-        source="found in the residual; h in µm, h̄ its Gaussian mean, x and y from -1 to 1 over the scan, "
-        "r² = x² + y², rim = e^(-distance to the edge / 2 µm), the order t from -0.5 to 0.5",
-        separating=_TURN,
-        knowledge="law",
+def _crowding() -> Iterator[Facts]:
+    formula = "D (mean of D within the length / full height)^power"
+    yield (
+        "dose-times-density",
+        formula,
+        "µm",
+        lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
     )
 
 
-@of_development(
-    "height changed by a wave of the height itself, sin(2π f h + phase)",
-    {
-        "sine_um": Parameter("µm", -0.2, 0.2, 0.02),
-        "cosine_um": Parameter("µm", -0.2, 0.2, 0.02),
-        "frequency_per_um": Parameter("1/µm", 2.0, 10.0, 5.0, "shape", tried=_FREQUENCIES_PER_UM),
-    },
-    role="undetermined",
-    source="found in the residual; h in µm",
-    separating="print a staircase of small steps",
-    knowledge="law",
-)
-def height_wave(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """As slices or standing waves leave it."""
-    phase = 2 * math.pi * values["frequency_per_um"] * height
-    return height + values["sine_um"] * phase.sin() + values["cosine_um"] * phase.cos()
+def _law(
+    name: str, formula: str, unit: str, column: Column, shapes: Mapping[str, Parameter], on: ActsOn
+) -> Effect:
+    unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
+
+    def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
+        return field + values["strength"] * column(Surface(field, context, values))
+
+    strength = Parameter(unit_of_strength[unit], -4.0, 4.0, 0.05)
+    return _nameless(name, formula, {"strength": strength, **shapes}, apply, on)
+
+
+def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
+    """The wave that slices leave in the dose, or standing light in the height; at zero it is zero."""
+
+    def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
+        phase = 2 * math.pi * values["frequency_per_um"] * field
+        return field + values["sine_um"] * phase.sin() + values["cosine_um"] * (phase.cos() - 1)
+
+    amplitude, (lowest, *_, highest) = Parameter("µm", -0.2, 0.2, 0.02), tried
+    frequency = Parameter("1/µm", lowest, highest, 5.0, "shape", tried=tried)
+    parameters = {"sine_um": amplitude, "cosine_um": amplitude, "frequency_per_um": frequency}
+    return _nameless(f"{_FIELD[on]}-wave", "a wave of itself, sin(2π f h + phase)", parameters, apply, on)
+
+
+def _nameless(
+    name: str, formula: str, parameters: Mapping[str, Parameter], apply: Apply, on: ActsOn
+) -> Effect:
+    return Effect(
+        name=name,
+        title=f"{_FIELD[on]} changed by {formula}",
+        stage="development" if on == "height" else "exposure",
+        role="undetermined",
+        acts_on=on,
+        parameters=parameters,
+        apply=apply,
+        source="found in the residual; h and the dose D in µm, h̄ the Gaussian mean of h over a length; "
+        "x and y from -1 to 1 over the scan, r² = x² + y², rim = e^(-distance to the edge / 2 µm), the "
+        "order t from -0.5 to 0.5; slopes and sides are along axes turned by turn_deg",
+        separating=_TURNED,
+        knowledge="law",
+    )
 
 
 def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Effect]:
@@ -245,7 +242,7 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
         {name: Parameter(unit, -1.0, 1.0, 0.02) for name in names},
         role="undetermined",
         source="a table along a covariate",
-        separating=_TURN,
+        separating=_TURNED,
         knowledge="description",
     )
 
@@ -283,7 +280,27 @@ def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 
 
-_POSITION = Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
-_OF_JUMPS = [_law(*facts, position=_POSITION) for axis in ("x", "y") for facts in _jumps(axis)]
-LAWS = {law.name: law for law in (*(_law(*facts) for facts in _columns()), *_OF_JUMPS, height_wave)}
+_OF_HEIGHT: Families = (
+    (_fixed(), {}),
+    (_steepness(), _POWER),
+    (map(_power, "xy"), {**_POWER, **_TURN}),
+    ((*_one_way("x"), *_one_way("y")), _TURN),
+    (_nearby(), _REACH),
+    ((*_jumps("x"), *_jumps("y")), _POSITION),
+)
+_OF_DOSE: Families = (
+    (
+        (_beside("dose-along-x", "left", "right"), _beside("dose-along-y", "above", "below")),
+        {**_TAIL, **_TURN},
+    ),
+    ((_beside(f"dose-from-{side}", side) for side in _SIDES), {**_TAIL, **_TURN}),
+    (_crowding(), {**_REACH, **_POWER}),
+)
+_FOUND = [
+    *(_law(*facts, shapes, "height") for family, shapes in _OF_HEIGHT for facts in family),
+    *(_law(*facts, shapes, "layout") for family, shapes in _OF_DOSE for facts in family),
+    _wave("height", _WAVES_PER_UM),
+    _wave("layout", _WAVES_PER_UM[:9]),
+]
+LAWS = {law.name: law for law in _FOUND}
 TABLES = {one.name: one for one in (level_table, linear_response, place_map)}

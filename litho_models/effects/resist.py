@@ -166,7 +166,7 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
         "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
         "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
         "exponent": Parameter("1", 0.7, 4.0, 2.0, "shape"),
-        "turn_deg": Parameter("deg", -45.0, 45.0, 0.0, "shape"),
+        "turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape"),
     },
     role="undetermined",
     trials=tuple(

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state, without_terms
-from litho_models.loop.judging import judge
+from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
 from litho_models.loop.search import Cause, describe, with_table
@@ -60,7 +60,7 @@ class Check:
     def of(self, cause: Cause) -> Cause:
         """Judge one cause with everything else in the model."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
-        cause = replace(cause, judgement=judge(without.freed_nm2, self.state.freed_nm2, self.study))
+        cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
         unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
@@ -108,7 +108,7 @@ class Check:
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
             numbers -= law.numbers
             laws.append(law.name)
-            if judge(self.state.freed_nm2, state.freed_nm2, self.study).passed():
+            if judge_states(self.state, state).passed():
                 return replace(cause, reason=f"short laws fit better instead: {', '.join(laws)}")
         return cause
 
@@ -122,7 +122,7 @@ class Check:
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
             if table.judgement.gain_nm2 > least_nm2:
                 both = with_table(self.state, table)
-                judged = judge(both.without(cause.name).freed_nm2, both.freed_nm2, self.study)
+                judged = judge_states(both.without(cause.name), both)
                 if reason := judged.reason(grouped=cause.by != ALL):
                     return replace(cause, reason=f"{table.name} explains the same and more: {reason}")
         return cause

@@ -18,7 +18,7 @@ from litho_models.effects import screened_effects
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import SMALLEST_SHARE, judge
+from litho_models.loop.judging import SMALLEST_SHARE, judge_states
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
@@ -204,7 +204,7 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
-        judgement = judge(found.state.freed_nm2, fitted.freed_nm2, state.study)
+        judgement = judge_states(found.state, fitted)
         if judgement.passed(grouped=table.by != ALL):
             found.state = fitted
             found.causes.append(replace(table, judgement=judgement))

@@ -118,7 +118,7 @@ class State:
         twin: the model fitted to all scans; ``per_fold``: the models fitted without each fold.
         linear: residual, derivatives and free terms of each window at ``twin``.
         held_out_um: residual (n,) of each window, predicted without its fold.
-        freed_nm2: (scans,) squared error per pixel of ``held_out_um`` after removal of the scan's free terms.
+        freed_um: the same residuals without the free terms of each scan.
     """
 
     study: Study
@@ -126,9 +126,14 @@ class State:
     per_fold: list[Twin]
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
-    freed_nm2: np.ndarray
+    freed_um: list[np.ndarray]
     # Cached models without one effect; several steps need the same one.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @cached_property
+    def freed_nm2(self) -> np.ndarray:
+        """Squared error (scans,) per pixel of ``freed_um``."""
+        return np.array([NM_PER_UM**2 * np.mean(left**2) for left in self.freed_um])
 
     @property
     def mse_nm2(self) -> float:
@@ -213,11 +218,10 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
     freed = [
-        without_terms(left[:, None], window, own)
+        without_terms(left[:, None], window, own)[:, 0]
         for left, window, own in zip(held_out, windows, maps, strict=True)
     ]
-    freed_nm2 = np.array([NM_PER_UM**2 * np.mean(left**2) for left in freed])
-    return State(study, common, per_fold, linear, held_out, freed_nm2)
+    return State(study, common, per_fold, linear, held_out, freed)
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:

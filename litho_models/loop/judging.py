@@ -1,4 +1,9 @@
-"""Decide whether held-out scans confirm a change of the model. Scans are the units."""
+"""Decide whether held-out scans confirm a change of the model. Scans are the units.
+
+Two things are asked. Does the change point the right way in the scans? That is a sign-flip test of its inner
+product with the residual before it, which is positive in every scan that has some of the effect. And does the
+change, at its common strength, lower the error? That is the interval of the gain.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_models.loop.fits import Study
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop.fits import State, Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
 # Limit of p for a grouping. It is strict because every candidate is tried with every grouping.
 EXCHANGED_P = 0.01
-# Seven gains in seven scans have p = 1/128 by chance, so fewer than eight scans confirm nothing.
+# Seven scans that agree have p = 1/128 by chance, so fewer than eight scans confirm nothing.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
 # A strength by group has passed the test with permuted labels, so half of the scans may gain nothing.
@@ -29,7 +35,7 @@ class Judgement:
     Attributes:
         before_nm2, gain_nm2: mean squared error before the change, and its decrease.
         gains_nm2: (scans,) gain of each scan.
-        p: one-sided, by sign flips of the scans' gains; ``low_nm2``: lower end of the interval.
+        p: one-sided, by sign flips of the scans' evidence; ``low_nm2``: lower end of the gain's interval.
     """
 
     before_nm2: float
@@ -66,11 +72,29 @@ class Judgement:
         return ""
 
 
-def judge(before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study) -> Judgement:
-    """Judge a change by the squared error (scans,) before and after, nm²."""
+def judge(
+    before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study, evidence_nm2: np.ndarray | None = None
+) -> Judgement:
+    """Judge a change by the squared error (scans,) before and after, nm².
+
+    Args:
+        evidence_nm2: (scans,) product of the change with the residual before it; by default the gains.
+    """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)
-    return Judgement(float(before_nm2.mean()), float(gains.mean()), gains, one_sided_flip_p(gains), low)
+    p = one_sided_flip_p(gains if evidence_nm2 is None else evidence_nm2)
+    return Judgement(float(before_nm2.mean()), float(gains.mean()), gains, p, low)
+
+
+def judge_states(before: State, after: State) -> Judgement:
+    """Judge the change from one fitted model to another."""
+    evidence = [evidence_nm2(*pair) for pair in zip(before.freed_um, after.freed_um, strict=True)]
+    return judge(before.freed_nm2, after.freed_nm2, after.study, np.array(evidence))
+
+
+def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
+    """Mean product of a change with the residual before it; NaN where not measured."""
+    return NM_PER_UM**2 * float(np.nanmean(before_um * (before_um - after_um)))
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:

@@ -7,7 +7,7 @@ scan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -78,7 +78,7 @@ class Screening:
     Args:
         state: the current model; ``effects``: candidates that it does not contain.
         secants: taken at a similar model; by default at the state.
-        kept: parameters of the model that are not projected out.
+        beside_own: whether candidates are judged beside the model's own parameters, which are projected out.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Screening:
         state: State,
         effects: Sequence[Effect],
         secants: Secants | None = None,
-        kept: Collection[int] = (),
+        beside_own: bool = True,
     ):
         self.study, self._mse_nm2 = state.study, state.mse_nm2
         own = len(state.twin.vector)
@@ -100,7 +100,7 @@ class Screening:
             grams.append(whole - gram_inside(stacked, free) / len(stacked))
             raw = raw + np.diag(whole)
         products = Products(np.stack(grams), self.study.groups)
-        self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if i not in kept]).grams
+        self.freed = products.freed_of([Block((1 + i,)) for i in range(own) if beside_own]).grams
         self._beside_base, self._retained = (
             np.einsum("sii->i", one) / raw for one in (products.grams, self.freed)
         )

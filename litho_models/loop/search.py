@@ -15,7 +15,7 @@ import numpy as np
 from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import EXCHANGED_P, GROUPED_P, Judgement, judge, told_apart
+from litho_models.loop.judging import EXCHANGED_P, GROUPED_P, Judgement, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
 from litho_models.loop.screening import Screened, Screening, best_grouping
 from litho_models.loop.trials import Secants
@@ -122,7 +122,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
         left = [one for one in left if one not in entering]
         fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
-            judgement = judge(found.state.freed_nm2, fitted[one.name].freed_nm2, study)
+            judgement = judge_states(found.state, fitted[one.name])
             if refused := judgement.reason(grouped=one.by != ALL):
                 found.refused[one.name] = refused
                 continue
@@ -130,26 +130,30 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
             found.causes.append(Cause(one.name, one.by, alike, judgement, one.family_p, one.group_p))
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
-            if one.by == ALL:
-                _regroup(found)
+            _regroup(found, one.name)
             gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
             study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
 
 
-def _regroup(found: Found) -> None:
-    """Let the strength of the last added cause differ by group, if that is confirmed.
+def _regroup(found: Found, name: str) -> None:
+    """Let the common strength of a cause differ by group, if that is confirmed.
 
     The derivative at the fitted strength is more reliable than the one at zero used in screening.
     """
-    cause, twin, study = found.causes[-1], found.state.twin, found.state.study
+    twin, study = found.state.twin, found.state.study
+    at_cause = found.names.index(name)
+    cause = found.causes[at_cause]
+    if cause.by != ALL:
+        return
     slots = {
         at: slot
         for at, slot in enumerate(twin.slots, twin.own)
-        if slot.effect == cause.name and slot.facts.kind == "amplitude"
+        if slot.effect == name and slot.facts.kind == "amplitude"
     }
-    screening = Screening(found.state, (), kept=slots)
+    # Common parameters cannot explain a difference between groups.
+    screening = Screening(found.state, (), beside_own=False)
 
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return screening.gains_by(labels, [1 + at for at in slots])
@@ -162,16 +166,16 @@ def _regroup(found: Found) -> None:
     p = screening.exchanged_p(by, gains[by], lambda labels: gained(labels)[0])
     if p > EXCHANGED_P:
         return
-    known = twin.values({})[cause.name]
+    known = twin.values({})[name]
     starts = {label: dict(known) for label in groups[by]}
     for label, steps in gained(groups[by])[1].items():
         for slot, step in zip(slots.values(), steps.tolist(), strict=True):
             value = known[slot.parameter] + step
             starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
-    state = fit_state(twin.without(cause.name).with_effect(cause.name, by, starts), study, from_here=True)
-    if judge(found.state.freed_nm2, state.freed_nm2, study).p <= GROUPED_P:
-        study.report(f"{cause.name} differs by {by}")
-        found.causes[-1] = replace(cause, by=by, group_p=p)
+    state = fit_state(twin.without(name).with_effect(name, by, starts), study, from_here=True)
+    if judge_states(found.state, state).p <= GROUPED_P:
+        study.report(f"{name} differs by {by}")
+        found.causes[at_cause] = replace(cause, by=by, group_p=p)
         found.state = state
 
 
@@ -230,14 +234,19 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Test each cause again beside all others, and remove it if it is no longer confirmed."""
+    """Test each cause again beside all others, and remove it if it is no longer confirmed.
+
+    A strength that differs by group may show only when the other causes are in the model.
+    """
     if len(found.causes) < 2:
         return
     study = found.state.study
+    for name in found.names:
+        _regroup(found, name)
     for cause in list(found.causes):
         study.report(f"testing again: {cause.name}")
         without = found.state.without(cause.name)
-        judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
+        judgement = judge_states(without, found.state)
         at = found.causes.index(cause)
         if judgement.passed(grouped=cause.by != ALL):
             found.causes[at] = replace(cause, judgement=judgement)

@@ -7,7 +7,6 @@ fitted on one half of a scan's pixels, it must agree with the other half.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -16,7 +15,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import line_period
 from litho_models.effects import get_effect
 from litho_models.loop.fits import Study
-from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, judge
+from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, evidence_nm2, judge
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.record import ScanFinding, Strength
 from litho_models.scan_terms import (
@@ -202,8 +201,8 @@ def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: S
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
-    products = [np.nanmean(one * (one - left)) for one, left in zip(*residuals_um, strict=True)]
-    return replace(judge(was, now, study), p=one_sided_flip_p(np.array(products)))
+    evidence = [evidence_nm2(*pair) for pair in zip(*residuals_um, strict=True)]
+    return judge(was, now, study, np.array(evidence))
 
 
 def _frame(effect: str) -> str:

@@ -154,7 +154,7 @@ def test_a_benchmark_is_the_same_to_the_bit(
 
 @pytest.mark.long
 def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    law, scans = "slope-x-power-1", planted(count=6)
+    law, scans = "height-times-slope-size-x", planted(count=6)
     here = study_of(scans, folds=2)
     studies = here, replace(here, workers=Workers(dask=address))
     state = bare_state(here)

@@ -40,7 +40,7 @@ from tests.litho_models.loop_scans import (
 )
 from tests.litho_models.prints import make_scans, write_store
 
-LAW = "slope-x-power-1"
+LAW = "height-times-slope-size-x"
 STRENGTH = {"strength": 0.04}
 
 

@@ -14,7 +14,7 @@ from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.effects.registry import register_effect
 
-PITCH_UM, SHAPE = 0.1, (170, 168)
+PITCH_UM, SHAPE, FULL_UM = 0.1, (170, 168), 1.2
 NAMELESS = {**LAWS, **TABLES}
 BY_NAME = pytest.mark.parametrize("name", NAMELESS)
 # Slopes are rounded off below this, and a size by no more than this.
@@ -33,8 +33,8 @@ HEIGHT = height_of()
 
 
 def context_of(height: np.ndarray, pitch_um: float = PITCH_UM) -> FieldContext:
-    layout = torch.from_numpy(np.round(np.clip(height, 0, 1.2), 1))[None, None]
-    return FieldContext(layout, pitch_um, 1.2, order=0.3)
+    layout = torch.from_numpy(np.round(np.clip(height, 0, FULL_UM), 1))[None, None]
+    return FieldContext(layout, pitch_um, FULL_UM, order=0.3)
 
 
 def changed(
@@ -49,11 +49,17 @@ def changed(
 # The formulas anew: slopes by central differences, means by a Gaussian, sides by a running mean.
 
 
-def slope(h: np.ndarray, along: str) -> np.ndarray:
+def turned(axis: str, turn_deg: float, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The part along an axis that was turned from x towards y."""
+    cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    return cosine * x + sine * y if axis == "x" else cosine * y - sine * x
+
+
+def slope(h: np.ndarray, axis: str, turn_deg: float = 0.0) -> np.ndarray:
     padded = np.pad(h, 1, mode="edge")
     x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * PITCH_UM)
     y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * PITCH_UM)
-    return {"x": x, "y": y, "diagonal": (x + y) / 2**0.5, "antidiagonal": (y - x) / 2**0.5}[along]
+    return turned(axis, turn_deg, y, x)
 
 
 def mean_within(h: np.ndarray, reach_um: float) -> np.ndarray:
@@ -69,19 +75,21 @@ def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
     return {"left": found, "right": found[:, ::-1], "above": found.T, "below": found[:, ::-1].T}[side]
 
 
-def along(h: np.ndarray, direction: str, length_um: float) -> np.ndarray:
-    """The mean of both sides; of a diagonal by its frequencies."""
-    if direction in "xy":
-        sides = ("left", "right") if direction == "x" else ("above", "below")
-        return (beside(h, sides[0], length_um) + beside(h, sides[1], length_um)) / 2
+AXES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y", 1)}
+
+
+def tail(h: np.ndarray, sides: tuple[str, ...], length_um: float, turn_deg: float) -> np.ndarray:
+    """The mean of the sides; if they are turned, by their frequencies."""
+    if not turn_deg:
+        return np.mean([beside(h, side, length_um) for side in sides], axis=0)
     edge = 6 * round(length_um / PITCH_UM)
     padded = np.pad(h, edge, mode="edge")
-    fy, fx = (np.fft.fftfreq(n, PITCH_UM) for n in padded.shape)
-    sign = {"diagonal": 1, "antidiagonal": -1}[direction]
-    frequency = (fy[:, None] + sign * fx[None, :]) / 2**0.5
-    transfer = 1 / (1 + length_um / PITCH_UM * (1 - np.exp(-2j * np.pi * frequency * PITCH_UM)))
-    filtered = np.fft.ifft2(np.fft.fft2(padded) * transfer.real).real
-    return filtered[edge:-edge, edge:-edge]
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n, PITCH_UM) for n in padded.shape), indexing="ij")
+    transfer = np.zeros(padded.shape, complex)
+    for axis, sign in (AXES[side] for side in sides):
+        delay = np.exp(2j * np.pi * sign * turned(axis, turn_deg, fy, fx) * PITCH_UM)
+        transfer += 1 / (1 + length_um / PITCH_UM * (1 - delay)) / len(sides)
+    return np.fft.ifft2(np.fft.fft2(padded) * transfer).real[edge:-edge, edge:-edge]
 
 
 Y, X = (np.linspace(-1, 1, n) for n in SHAPE)
@@ -92,83 +100,96 @@ EDGE_PX = np.minimum(
 )
 PLACES["rim"] = np.exp(-EDGE_PX * PITCH_UM / 2.0)
 ORDER = 0.3
-# A jump at the middle, between two pixels or on one, which then is half on either side.
-JUMPS = {axis: np.clip(PLACES[axis] * (n - 1) / 2 + 0.5, 0, 1) for axis, n in zip("yx", SHAPE, strict=True)}
-SIDES = ("left", "right", "above", "below")
 
 
-def formulas() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
-    found: dict[str, Callable[[np.ndarray], np.ndarray]] = {}
-    for axis in ("x", "y", "diagonal", "antidiagonal"):
-        for power in (1, 1.5, 2, 3):
-            name = f"slope-{axis}-power-{power}".replace(".", "-")
-            found[name] = lambda h, a=axis, p=power: np.abs(slope(h, a)) ** p
-        found[f"rising-slope-{axis}"] = lambda h, a=axis: np.maximum(slope(h, a), 0)
-        found[f"falling-slope-{axis}"] = lambda h, a=axis: np.maximum(-slope(h, a), 0)
+def jump(axis: str, at: float) -> np.ndarray:
+    """1 beyond a position from -1 to 1, 0 before it, and a share at the pixel that it cuts."""
+    size = SHAPE["yx".index(axis)]
+    return np.clip((PLACES[axis] - at) * (size - 1) / 2 + 0.5, 0, 1)
+
+
+# Maps a height and the shapes of a law to the change by a strength of one.
+Formula = Callable[..., np.ndarray]
+
+
+def formulas() -> dict[str, Formula]:
+    found: dict[str, Formula] = {}
     for axis in ("x", "y"):
+        found[f"slope-{axis}-power"] = lambda h, power, turn_deg, a=axis: (
+            np.abs(slope(h, a, turn_deg)) ** power
+        )
+        found[f"rising-slope-{axis}"] = lambda h, turn_deg, a=axis: np.maximum(slope(h, a, turn_deg), 0)
+        found[f"falling-slope-{axis}"] = lambda h, turn_deg, a=axis: np.maximum(-slope(h, a, turn_deg), 0)
         found[f"height-times-slope-{axis}"] = lambda h, a=axis: h * slope(h, a)
         found[f"height-times-slope-size-{axis}"] = lambda h, a=axis: h * np.abs(slope(h, a))
         found[f"curvature-{axis}"] = lambda h, a=axis: slope(slope(h, a), a)
         found[f"slope-size-{axis}-times-order"] = lambda h, a=axis: np.abs(slope(h, a)) * ORDER
         for place, own in PLACES.items():
             found[f"slope-size-{axis}-times-{place}"] = lambda h, a=axis, p=own: np.abs(slope(h, a)) * p
-    for power in (1, 2):
-        found[f"steepness-power-{power}"] = lambda h, p=power: np.hypot(slope(h, "x"), slope(h, "y")) ** p
+        found[f"jump-along-{axis}-in-height"] = lambda h, position, a=axis: jump(a, position)
+        found[f"jump-along-{axis}-in-gain"] = lambda h, position, a=axis: h * jump(a, position)
+        for way in ("x", "y"):
+            found[f"jump-along-{axis}-in-{way}"] = lambda h, position, a=axis, w=way: (
+                slope(h, w) * jump(a, position)
+            )
     for power in (2, 3):
         found[f"height-power-{power}"] = lambda h, p=power: h**p
     for place, own in PLACES.items():
         found[f"height-times-{place}"] = lambda h, p=own: h * p
-        found[f"blur-{place}-1-5-um"] = lambda h, p=own: (mean_within(h, 1.5) - h) * p
-    for axis, at in JUMPS.items():
-        found[f"jump-along-{axis}-in-height"] = lambda h, p=at: p
-        found[f"jump-along-{axis}-in-gain"] = lambda h, p=at: h * p
-        for way in ("x", "y"):
-            found[f"jump-along-{axis}-in-{way}"] = lambda h, p=at, w=way: slope(h, w) * p
+        found[f"blur-times-{place}"] = lambda h, p=own: (mean_within(h, 1.5) - h) * p
     found["height-squared-times-order"] = lambda h: h**2 * ORDER
-    for reach in (0.6, 1.5, 4.0):
-        end = f"{reach:g}-um".replace(".", "-")
-        found[f"surroundings-{end}"] = lambda h, r=reach: mean_within(h, r) - h
-        found[f"blur-height-{end}"] = lambda h, r=reach: h * (mean_within(h, r) - h)
-        found[f"above-surroundings-{end}"] = lambda h, r=reach: (h - mean_within(h, r)) ** 2
-        found[f"steps-within-{end}"] = lambda h, r=reach: mean_within(
-            np.hypot(slope(h, "x"), slope(h, "y")), r
-        )
-    for axis in ("x", "y", "diagonal", "antidiagonal"):
-        for length in (2.0, 6.0):
-            found[f"along-{axis}-{length:g}-um"] = lambda h, a=axis, n=length: along(h, a, n) - h
-    for side in SIDES:
-        for length in (0.6, 2.0, 6.0):
-            name = f"{side}-{length:g}-um".replace(".", "-")
-            found[name] = lambda h, s=side, n=length: beside(h, s, n) - h
+    found["steepness-power"] = lambda h, power: np.hypot(slope(h, "x"), slope(h, "y")) ** power
+    found["surroundings"] = lambda h, length_um: mean_within(h, length_um) - h
+    found["blur-height"] = lambda h, length_um: h * (mean_within(h, length_um) - h)
+    found["above-surroundings"] = lambda h, length_um: (h - mean_within(h, length_um)) ** 2
+    found["steps-nearby"] = lambda h, length_um: mean_within(
+        np.hypot(slope(h, "x"), slope(h, "y")), length_um
+    )
+    found["dose-times-density"] = lambda h, length_um, power: (
+        h * (mean_within(h, length_um) / FULL_UM) ** power
+    )
+    both = {"along-x": ("left", "right"), "along-y": ("above", "below")}
+    for name, sides in {**both, **{f"from-{side}": (side,) for side in AXES}}.items():
+        found[f"dose-{name}"] = lambda h, length_um, turn_deg, s=sides: tail(h, s, length_um, turn_deg) - h
     return found
 
 
 FORMULAS = formulas()
+WAVES = ("height-wave", "dose-wave")
+
+
+def shapes_of(name: str) -> list[dict[str, float]]:
+    """The shapes in which a law is screened."""
+    shapes = [{k: v for k, v in trial.items() if k != "strength"} for trial in LAWS[name].trials]
+    return list(map(dict, dict.fromkeys(tuple(one.items()) for one in shapes)))
 
 
 def test_every_law_has_a_formula_here() -> None:
-    assert {*FORMULAS, "height-wave"} == set(LAWS)
+    assert {*FORMULAS, *WAVES} == set(LAWS)
     assert len({law.title for law in LAWS.values()}) == len(LAWS)
 
 
 @pytest.mark.parametrize("name", FORMULAS)
 def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
-    wanted = FORMULAS[name](HEIGHT)
-    assert wanted.std() > 1e-3
-    # Besides the rounding, which a place may double: a Gaussian ends after 4 sigma, a tail after 6 lengths,
-    # or a field, with what comes around from the other side.
-    allowed = 2 * ROUNDED
-    if name.split("-")[0] in (*SIDES, "along"):
-        steps = float(".".join(part for part in name.split("-") if part.isdigit())) / PITCH_UM
-        allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
-    found = changed(name, {"strength": 0.05}, HEIGHT)
-    np.testing.assert_allclose(found, 0.05 * wanted, atol=0.05 * allowed, rtol=1e-9)
+    for shape in shapes_of(name):
+        wanted = FORMULAS[name](HEIGHT, **shape)
+        assert wanted.std() > 1e-3
+        # Besides the rounding, which a place may double: a Gaussian ends after 4 sigma, a tail after 6
+        # lengths, or a field, with what comes around from the other side.
+        allowed = 2 * ROUNDED
+        if "length_um" in shape:
+            steps = shape["length_um"] / PITCH_UM
+            allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
+        found = changed(name, {"strength": 0.05, **shape}, HEIGHT)
+        np.testing.assert_allclose(found, 0.05 * wanted, atol=0.05 * allowed, rtol=1e-9)
 
 
-def test_a_wave_of_the_height_has_its_size_phase_and_period() -> None:
+@pytest.mark.parametrize("name", WAVES)
+def test_a_wave_has_its_size_phase_and_period_and_is_zero_at_zero(name: str) -> None:
     wave = {"sine_um": 0.03, "cosine_um": 0.04, "frequency_per_um": 3.0}
-    wanted = 0.05 * np.sin(2 * np.pi * 3 * HEIGHT + np.arctan2(0.04, 0.03))
-    np.testing.assert_allclose(changed("height-wave", wave, HEIGHT), wanted, atol=1e-9)
+    wanted = 0.05 * np.sin(2 * np.pi * 3 * HEIGHT + np.arctan2(0.04, 0.03)) - 0.04
+    np.testing.assert_allclose(changed(name, wave, HEIGHT), wanted, atol=1e-9)
+    np.testing.assert_allclose(changed(name, wave, 0 * HEIGHT), 0, atol=1e-12)
 
 
 @BY_NAME
@@ -192,7 +213,15 @@ def test_a_flat_print_has_a_finite_derivative(name: str) -> None:
 POWERS_OF_UM = {"1": 0, "µm": 1, "µm²": 2, "1/µm": -1, "1/µm²": -2}
 
 
-@pytest.mark.parametrize("name", [name for name in FORMULAS if not name.endswith(("-um", "-rim"))])
+# Without laws of a fixed length, or of a length in micrometres.
+SCALED = [
+    name
+    for name in FORMULAS
+    if "length_um" not in LAWS[name].parameters and name[:4] != "blur" and "rim" not in name
+]
+
+
+@pytest.mark.parametrize("name", SCALED)
 def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
     """In units half as large all lengths are twice as many, the change of the height too."""
     unit = LAWS[name].parameters["strength"].unit

@@ -35,14 +35,14 @@ def share(planted_name: str, fitted_name: str, beside: tuple[str, ...] = (), see
     return reshaped_gain(without, state) / gain
 
 
-@pytest.mark.parametrize("name", ["slope-x-power-1", "curvature-x", "slope-thinning"])
+@pytest.mark.parametrize("name", ["slope-x-power", "curvature-x", "slope-thinning"])
 def test_the_formula_of_the_cause_leaves_nothing_of_its_shape(name: str) -> None:
     assert share(name, name) < FORM_SHARE
 
 
 def test_a_mimic_is_refused() -> None:
-    """A loss along the slope is taken for one along its cube."""
-    assert share("slope-x-power-1", "slope-x-power-3") > FORM_SHARE
+    """A loss on slopes that grows with the height is taken for a loss on curvature."""
+    assert share("height-times-slope-size-x", "curvature-x") > FORM_SHARE
 
 
 def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
@@ -61,6 +61,14 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
     coarse, fine = shapes(0.1), shapes(0.004)
     assert all(np.allclose(a, b) for a, b in zip(coarse[:-4], fine[:-4], strict=True))
     assert all(np.allclose(0.1 * a, 0.004 * b) for a, b in zip(coarse[-4:], fine[-4:], strict=True))
+
+
+def squared(squares_nm2: float) -> dict[str, object]:
+    """Residuals of one pixel with this square in each of ten scans."""
+    return {
+        "freed_um": [np.array([1e-3 * squares_nm2**0.5])] * 10,
+        "freed_nm2": np.full(10, float(squares_nm2)),
+    }
 
 
 @pytest.mark.parametrize(
@@ -83,9 +91,9 @@ def test_the_limits_of_a_name_are_those_that_are_written(
     study = Study((), np.empty(0))
     cause = Cause("slope-thinning", ALL, (), judge(np.full(10, 100.0), np.full(10, 90.0), study), 0.01, None)
     state = SimpleNamespace(
-        freed_nm2=np.full(10, 90.0),
+        **squared(90),
         twin=SimpleNamespace(exhausts=lambda name: exhausted, slots=()),
-        without=lambda name: SimpleNamespace(freed_nm2=np.full(10, 100.0)),
+        without=lambda name: leaving(100),
         study=study,
     )
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: reshaped_nm2)
@@ -106,7 +114,7 @@ def gaining(name: str, gain_nm2: float) -> Cause:
 def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
     """A model that leaves so much in each of ten scans, and without any of its effects so much."""
     return SimpleNamespace(
-        freed_nm2=np.full(10, squares_nm2),
+        **squared(squares_nm2),
         twin=SimpleNamespace(exhausts=lambda name: [], slots=()),
         without=lambda name: leaving(without_nm2),
         study=STUDY,
@@ -120,7 +128,7 @@ def test_a_name_falls_if_laws_beside_it_take_more_than_half_of_its_gain(
     before_nm2: float, law: bool, falls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 0.0)
-    cause, other = gaining("slope-thinning", before_nm2), "slope-x-power-1" if law else "write-order-memory"
+    cause, other = gaining("slope-thinning", before_nm2), "slope-x-power" if law else "write-order-memory"
     check = Check(leaving(90), [cause, gaining(other, 5)], [], [], 0.0, None)
     assert bool(check.of(cause).reason) is falls
 
@@ -193,15 +201,16 @@ def test_of_bases_that_do_as_well_the_one_is_taken_whose_causes_the_others_share
 @pytest.mark.parametrize(
     ("small", "values", "corrected"),
     [
-        ("slope-x-power-3", {"strength": 0.004}, "slope-x-power-1"),
+        ("height-times-slope-size-x", {"strength": 0.02}, "slope-x-power"),
         ("field-curvature", {"tilt_x_um": 0.02}, ""),
     ],
 )
 def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     small: str, values: dict[str, float], corrected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The cube of a slope is the slope in another shape, a tilt of the field is not."""
-    strengths = {"slope-x-power-1": {"strength": 0.06}, small: get_effect(small).with_values(values)}
+    """A loss times the height is the loss in another shape, a tilt of the field is not."""
+    loss = get_effect("slope-x-power").with_values({"strength": 0.06})
+    strengths = {"slope-x-power": loss, small: get_effect(small).with_values(values)}
     study = study_of(planted([(name, ALL, {"": own}) for name, own in strengths.items()]))
     twin = bare_state(study).twin
     for name, own in strengths.items():
@@ -216,7 +225,7 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
     check = Check(state, causes, [], [], 0.0, None)
     # Beside a law without a name even a tilt is suspect.
-    assert check._larger(minor, without[small]) == "slope-x-power-1"
+    assert check._larger(minor, without[small]) == "slope-x-power"
     monkeypatch.setattr(checking, "get_effect", lambda name: get_effect("slope-thinning"))
     assert check._larger(minor, without[small]) == corrected
-    assert check._larger(large, without["slope-x-power-1"]) == ""
+    assert check._larger(large, without["slope-x-power"]) == ""

@@ -48,7 +48,7 @@ BASE = "affine-mtf"
 CAUSES = ("write-order-memory", "slope-thinning", "vertical-shrinkage")
 # What scans may share has its own tests.
 FEW_OFFERS = (("background", 2, False),)
-SOME_LAWS, TABLE = ("height-power-2", "slope-x-power-1"), "level-table"
+SOME_LAWS, TABLE = ("height-power-2", "height-times-slope-size-x"), "level-table"
 TABLES = {"errors.csv": "errors", "candidates.csv": "candidates", "explained.csv": "explained"}
 
 
@@ -392,7 +392,7 @@ def test_scans_of_different_sizes_are_taken_together(quick: None) -> None:
 def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     quick: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    law, seen = "slope-x-power-1", []
+    law, seen = "height-times-slope-size-x", []
     monkeypatch.setattr(closing, "LAWS", {law: get_effect(law)})
 
     def watched(scans: Sequence[PrintedScan]) -> Closed:

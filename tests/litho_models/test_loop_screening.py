@@ -15,7 +15,7 @@ from litho_models.loop.trials import Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Labels
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
-LAW = "slope-x-power-1"
+LAW = "slope-size-x-times-r2"
 EFFECTS = [get_effect(name) for name in (LAW, "height-power-2", "rising-slope-y", "place-map")]
 
 

@@ -9,12 +9,22 @@ import pytest
 
 from litho_models.effects import CATALOGUE, get_effect
 from litho_models.loop.closing import _in_model
-from litho_models.loop.fits import Study, fit_state
-from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
+from litho_models.loop.fits import State, Study, fit_state
+from litho_models.loop.judging import CONFIRM_P, FEWEST_SCANS, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
-from litho_models.loop.search import Found, describe, same_change, search, separating, untestable
+from litho_models.loop.search import (
+    Cause,
+    Found,
+    _defend,
+    describe,
+    same_change,
+    search,
+    separating,
+    untestable,
+)
 from litho_models.models import build_model
 from litho_models.scan_terms.grouped import ALL
+from litho_models.scoring.statistics import one_sided_flip_p
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 CANDIDATES = [
@@ -53,6 +63,19 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
     assert found.state.twin.values({"field": "1"})[THINNING]["along_x_um"] < 0.02
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
+
+
+def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
+    """Also of a cause that was not added last."""
+    values = {"1": thinning(0.1), "2": thinning(0.2)}
+    study = study_of(planted([(THINNING, "field", values), (MEMORY, ALL, {"": memory(0.3)})]))
+    twin = bare_state(study).twin.with_effect(THINNING, ALL, {"": thinning(0.15)})
+    state = fit_state(twin.with_effect(MEMORY, ALL, {"": memory(0.3)}), study)
+    judged = judge(np.full(10, 100.0), np.full(10, 50.0), study)
+    found = Found(state, [Cause(name, ALL, (), judged, 0.01, None) for name in (THINNING, MEMORY)])
+    _defend(found)
+    assert added(found) == {THINNING: "field", MEMORY: ALL}
+    assert found.state.twin.values({"field": "2"})[THINNING]["along_x_um"] == pytest.approx(0.2, rel=0.1)
 
 
 def test_a_cause_in_all_scans_is_found_with_one_strength() -> None:
@@ -174,6 +197,26 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
     assert not half.passed()
     assert half.passed(grouped=True)
     assert half.improved == (5, 10)
+
+
+def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -> None:
+    """Three of ten scans have 0.4 of the strength, so they lose by the mean one, but it is there in all."""
+    strengths = np.where(np.arange(10) < 3, 0.4, 1.0)
+    noise = np.random.default_rng(0).normal(size=(10, 50_000))
+    change = np.random.default_rng(1).normal(size=50_000)
+
+    def state(common: float) -> State:
+        left_um = 1e-3 * (noise + (strengths[:, None] - common) * change)
+        return State(STUDY, Twin.bare(build_model("affine")), [], [], [*left_um], [*left_um])
+
+    judged = judge_states(state(0.0), state(strengths.mean()))
+    assert judged.improved == (7, 10)
+    assert one_sided_flip_p(judged.gains_nm2) > CONFIRM_P
+    assert judged.p == pytest.approx(2**-10)
+    # <c, (s - m) c + n> of the mean strength m and a scan's strength s.
+    gains = strengths**2 - (strengths - strengths.mean()) ** 2
+    np.testing.assert_allclose(judged.gains_nm2, gains, atol=4 * 2 / 50_000**0.5)
+    assert judged.passed()
 
 
 def test_the_reason_says_what_is_missing() -> None:

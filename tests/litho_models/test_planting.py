@@ -19,7 +19,7 @@ from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.search import search
 from tests.litho_models.loop_scans import base_model, planted, study_of
 
-LAW = "slope-x-power-1"
+LAW = "height-times-slope-size-x"
 
 
 def closed_on(scans: Sequence[PrintedScan]) -> Closed:
