@@ -311,7 +311,9 @@ def text_of(record: Mapping[str, Any]) -> str:
         )
         for one in loop["effects"]
     ]
-    found += [(one["name"], "", "", "", f"{one['verdict']}: {one['reason']}") for one in loop["candidates"]]
+    found += [
+        (one["name"], "–", "–", "–", f"{one['verdict']}: {one['reason']}") for one in loop["candidates"]
+    ]
     edges = "Edges of held-out patterns: {:.2f} nm before, {:.2f} nm after.".format(*loop["edges_nm"])
     loop_heads = ("cause", "size", "gain, squared error", "patterns improved", "verdict")
     return f"{markdown_table(heads, rows)}\n\n{markdown_table(loop_heads, found)}\n\n{edges}"

@@ -17,12 +17,14 @@ _LINK = re.compile(r"\]\((?P<place>\.\./[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 _EVERYDAY = {"arm", "effect", "fold", "judge", "knob", "probe", "stroke"}
 # A cell of more letters than this is given room, on a telephone or at the head; the table scrolls.
 _LONG_CELL = 40
-# Spaces inside a figure, outside code: 19.1 nm, (18.2 … 19.9), ± 0.2, → 15.6, 20 of 20, p = 0.03.
+# Where a line would break inside a figure, outside code: 19.1 nm, (18.2 … 19.9), ± 0.2, → 15.6, 20 of 20,
+# p = 0.03, 71–99 %, 1e-12.
 _INSIDE_FIGURE = re.compile(
-    r"<(pre|code)\b.*?</\1>|<[^>]*>|(?<=\d) (?=(?:nm|µm|dB|px|ms|s|MiB|GiB)\b|[%…±]|of \d)"
-    r"|(?<=[…±→=]) (?=[-−+\d])|(?<=\d of) (?=\d)|(?<=\b[kp]) (?==)",
+    r"<(pre|code)\b.*?</\1>|<[^>]*>|(?<=\d) (?=(?:nm|µm|mm|dB|px|ms|s|min|h|MiB|GiB|TiB)\b|[%…±]|of \d)"
+    r"|(?<=[…±→=]) (?=[-−+\d])|(?<=\d of) (?=\d)|(?<=\b[kp]) (?==)|(?<=\d)–(?=\d)|(?<=\de)-(?=\d)",
     re.DOTALL,
 )
+_UNBROKEN = {" ": "\u00a0", "–": "–\u2060", "-": "-\u2060"}
 _LANGUAGES = {".py": "python", ".toml": "toml", ".json": "json"}
 
 
@@ -61,7 +63,7 @@ def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
     """
     html = re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
     html = re.sub(r"<(t[dh])>(.*?)</t[dh]>", _roomy, html, flags=re.DOTALL)
-    html = _INSIDE_FIGURE.sub(lambda found: "\u00a0" if found[0] == " " else found[0], html)
+    html = _INSIDE_FIGURE.sub(lambda found: _UNBROKEN.get(found[0], found[0]), html)
     html = re.sub(r"<a [^>]*>\s*<img.*?</a>|<img [^>]*>", _opened, html, flags=re.DOTALL)
     return re.sub(r"<pre>.*?</pre>|(?<=<code>)[^<]+(?=</code>)", _breakable, html, flags=re.DOTALL)
 
@@ -100,11 +102,8 @@ def _target(page: str, link: str) -> str | None:
 
 
 def _shown(file: Path) -> str:
-    """A file as a page: Markdown without its links, code as code."""
-    text = file.read_text("utf-8")
-    if file.suffix == ".md":
-        return re.sub(r"!?\[([^\]]*)\]\((?!http)[^)]*\)", r"\1", text)
-    return f"# {file.name}\n\n```{_LANGUAGES.get(file.suffix, '')}\n{text}\n```\n"
+    """A file of code as a page."""
+    return f"# {file.name}\n\n```{_LANGUAGES.get(file.suffix, '')}\n{file.read_text('utf-8')}\n```\n"
 
 
 def _reference(package: str) -> str:

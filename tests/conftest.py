@@ -6,11 +6,16 @@ import gc
 import os
 from collections.abc import Generator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from litho_data.foundation.faces import let_waiting_threads_sleep
 from litho_data.reports import page as report
+from tests.figures import require_legible
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Before any test loads torch.
 let_waiting_threads_sleep()
@@ -19,10 +24,19 @@ let_waiting_threads_sleep()
 BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
 
 
+_figure = report.Page.figure
+
+
+def _legible(page: report.Page, figure: Figure, caption: str) -> None:
+    require_legible(figure)
+    _figure(page, figure, caption)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Figures are made, but drawn only for tests marked ``pictures``."""
+    """Figures are made and looked at, but drawn only for tests marked ``pictures``."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report.Page, "figure", _legible)
         if item.get_closest_marker("pictures") is None:
             patch.setattr(report, "svg_address", lambda figure: BLANK)
         return (yield)

@@ -1,8 +1,9 @@
 """Small faults at places that a seed draws over the whole product, to see how many the tests notice.
 
-``python -m tests.drawn_faults SEED COUNT`` prints them; with a FILE of lines ``NUMBER TESTS`` it puts each in
-and runs those tests. Each line of code is as likely as another, and so is each change that can be made in it.
-What is stated once as a constant or a default is a choice, and no fault if it is another.
+``python -m tests.drawn_faults SEED COUNT`` prints them; with a FILE of lines ``NUMBER TESTS`` it puts each
+in, asks mypy and runs those tests. Each line of code is as likely as another, and so is each change that can
+be made in it. What is stated once as a constant or a default is a choice, and no fault if it is another; the
+smaller of two numbers is the same in either order, and that a ``zip`` is strict does nothing else.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ PAIRS = (
 PAIRS += (
     ",floor ceil,minimum maximum,fft2 ifft2,first second,first last,width_um height_um,union intersection"
 )
+EITHER_WAY = {"min", "max", "minimum", "maximum", "hypot"}
 NAMES = {one: other for pair in PAIRS.split(",") for one, other in (pair.split(), pair.split()[::-1])}
 
 
@@ -60,6 +62,8 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
         case ast.Tuple(elts=[first, second, *_], ctx=ast.Load()) | ast.List(elts=[first, second, *_]):
             new.elts[:2] = [second, first]
             yield new
+        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in EITHER_WAY:
+            return
         case ast.Call(args=[first, second, *_]):
             new.args[:2] = [second, first]
             yield new
@@ -73,6 +77,8 @@ def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
     for child in ast.iter_child_nodes(tree):
         types = getattr(tree, "annotation", 0), getattr(tree, "returns", 0)
         if isinstance(child, ast.arguments | ast.JoinedStr | ast.Raise) or child in types:
+            continue
+        if isinstance(child, ast.keyword) and child.arg == "strict":
             continue
         if within:
             yield child
@@ -110,7 +116,7 @@ def main(seed: str, count: str, file: str = "") -> int:
         print(*(one.name for one in faults), sep="\n")
         return 0
     lines = [line.split(maxsplit=1) for line in Path(file).read_text(encoding="utf-8").splitlines()]
-    return try_all([faults[int(number) - 1]._replace(tests=tests) for number, tests in lines])
+    return try_all([faults[int(number) - 1]._replace(tests=tests) for number, tests in lines], typed=True)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,12 @@ import importlib
 import os
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,6 +33,7 @@ PARTS = (
     "docs",
     "pyproject.toml",
 )
+_MYPY = [sys.executable, "-m", "mypy", *(word for part in PARTS[:3] for word in ("-p", part))]
 PRELOADED = ["torch", "scipy.optimize", "scipy.stats", "xarray", "zarr", "pandas", "matplotlib.figure"]
 
 
@@ -241,28 +245,49 @@ FAULTS = [
     Fault("a model's name taken for a loaded one", "litho_design/printers/source.py",
           "if isinstance(item, str):\n            first", "if isinstance(str, item):\n            first",
           "tests/litho_design/test_frozen_printer.py -k as_words"),
+    Fault("one flat scan among others", "litho_models/loop/search.py",
+          "one_level = all(", "one_level = any(", "tests/litho_models/test_loop_search.py -k cannot_test"),
+    Fault("outcomes of the rivals in another order", "litho_models/planning/answers.py",
+          "it is {name}\" for name in names),\n            \"two fit",
+          "it is {name}\" for name in names[::-1]),\n            \"two fit", f"{NEXT} -k waiting"),
+    Fault("a meaning before its name", "litho_data/reports/page.py",
+          '[(column["name"], column["meaning"])', '[(column["meaning"], column["name"])',
+          "tests/test_tables.py -k meaning"),
+    Fault("frequency against power", "litho_data/layouts/statistics_report.py",
+          "step(statistics.frequency_per_um, statistics.power_share,",
+          "step(statistics.power_share, statistics.frequency_per_um,", "tests/test_tables.py -k graphs"),
 ]  # fmt: skip
 
 
-def catches(fault: Fault, copy: Path) -> str:
-    """The test that fails with a fault; empty if none does."""
+def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
+    """The test that fails with a fault, or mypy if it is asked first; empty if none does."""
+    with _put_in(fault, copy):
+        if typed and subprocess.run([*_MYPY], cwd=copy, capture_output=True).returncode:
+            return "mypy"
+        words, _, chosen = fault.tests.partition(" -k ")
+        arguments = ["-qx", "-p", "no:cacheprovider", *words.split(), *(["-k", chosen] if chosen else [])]
+        with tempfile.TemporaryFile("w+") as said:
+            child = os.fork()
+            if child == 0:
+                _run(copy, arguments, said.fileno())
+            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            said.seek(0)
+            failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said.read(), re.MULTILINE)
+    # 0 and 1: tests passed and failed; 2: what they import does not even load.
+    assert code in (0, 1, 2), f"{fault.name}: no answer of {fault.tests}"
+    return failed[1] if failed else ""
+
+
+@contextmanager
+def _put_in(fault: Fault, copy: Path) -> Iterator[None]:
     file = copy / fault.file
     text = file.read_text(encoding="utf-8")
     assert text.count(fault.right) == 1, f"{fault.name}: {fault.file} no longer holds {fault.right!r} once"
     file.write_text(text.replace(fault.right, fault.wrong), encoding="utf-8")
-    words, _, chosen = fault.tests.partition(" -k ")
-    arguments = ["-qx", "-p", "no:cacheprovider", *words.split(), *(["-k", chosen] if chosen else [])]
-    with tempfile.TemporaryFile("w+") as said:
-        child = os.fork()
-        if child == 0:
-            _run(copy, arguments, said.fileno())
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        said.seek(0)
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said.read(), re.MULTILINE)
-    file.write_text(text, encoding="utf-8")
-    # 0 and 1: tests passed and failed; 2: what they import does not even load.
-    assert code in (0, 1, 2), f"{fault.name}: no answer of {fault.tests}"
-    return failed[1] if failed else ""
+    try:
+        yield
+    finally:
+        file.write_text(text, encoding="utf-8")
 
 
 def _run(copy: Path, arguments: list[str], said: int) -> None:
@@ -282,8 +307,12 @@ def _run(copy: Path, arguments: list[str], said: int) -> None:
         os._exit(code)
 
 
-def try_all(faults: list[Fault]) -> int:
-    """Put in one fault after the other; returns how many were not caught."""
+def try_all(faults: list[Fault], typed: bool = False) -> int:
+    """Put in one fault after the other; returns how many were not caught.
+
+    Args:
+        typed: mypy is asked before the tests, as in CI.
+    """
     missed = 0
     for name in PRELOADED:
         importlib.import_module(name)
@@ -291,9 +320,11 @@ def try_all(faults: list[Fault]) -> int:
         for part in PARTS:
             copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
             copy(ROOT / part, Path(folder) / part)
+        if typed:
+            subprocess.run([*_MYPY], cwd=folder, check=True)
         for fault in faults:
             began_s = time.monotonic()
-            test = catches(fault, Path(folder))
+            test = catches(fault, Path(folder), typed)
             seconds = f"{time.monotonic() - began_s:.0f} s"
             print(f"{'caught' if test else 'MISSED'}  {seconds}  {fault.name}  {test}", flush=True)
             missed += not test

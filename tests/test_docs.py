@@ -72,6 +72,14 @@ def test_a_list_stands_apart_from_the_text_before_it(page):
     """The site's Markdown, unlike GitHub's, otherwise runs its points together in one paragraph."""
     text = _FENCED.sub("", page.read_text("utf-8"))
     assert re.findall(r"^(?![-*|#<]|\d+\. | |$).*\n(?:[-*]|\d+\.) .*$", text, re.MULTILINE) == []
+    # A further paragraph of a point, and the next point right below it.
+    assert re.findall(r"\n\n {4,}(?![-*]|\d+\. ).*(?:\n .*)*\n(?:[-*]|\d+\.) .*", text) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_cell_ends_in_braces(page):
+    """The site's Markdown takes them as attributes of the cell and drops them."""
+    assert re.findall(r"^\|.* \{[^`|\n]*\} *\|.*$", page.read_text("utf-8"), re.MULTILINE) == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -3,23 +3,54 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from litho_data.foundation.results import Record
+from litho_data.layouts.statistics import LayoutStatistics
+from litho_data.layouts.statistics_report import statistics_page
+from litho_data.making import report as of_build
+from litho_data.making.gratings import GratingScan
+from litho_data.making.result import BuildResult, LeftOut
+from litho_data.making.suggest import Suggestion
+from litho_data.making.suggest import _write_page as write_suggestion
+from litho_data.making.verdict import Finding
 from litho_data.reports.page import Page
+from litho_data.store.schema import DatasetId
 from litho_design.reports.tables import level_table
+from litho_design.sheets.read import _write_report as write_sheet
+from litho_design.sheets.record import ReadSheet
 from litho_models.evaluation.plots import error_bars, line_profiles
 from litho_models.evaluation.results import Benchmark
 from litho_models.evaluation.wording import benchmark_verdict
 from tests.litho_models.prints import make_scan
 from tests.tables import require_tables_equal_record
 
-PUBLISHED = Path(__file__).parents[1] / "docs" / "results" / "neural-lithography"
+ROOT = Path(__file__).parents[1]
+PUBLISHED = ROOT / "docs" / "results" / "neural-lithography"
+# The tables of the product by the test that holds their columns: one that is in none of these has no law.
+HELD = {
+    "test_tables.py": "gratings left_out findings warnings recipes holograms errors levels",
+    "litho_data/test_height_sigma.py": "quality summary uncertainty",
+    "litho_data/test_layouts.py": "scans",
+    "litho_models/test_next_print.py": "questions order scans",
+    "litho_models/test_evaluate.py": "headline metrics scans levels",
+    "litho_models/test_benchmark.py": "benchmark pairs lock_box fits policies",
+    "litho_models/test_check.py": "figures scans",
+    "litho_models/test_noise_results.py": "surfaces print_noise texture steps doses dose_levels calibration "
+    "calibration_scans variance spread budget flat_levels",
+    "litho_models/test_loop_run.py": "effects strengths explained errors single_scans planted candidates",
+    "laws/test_blind_trials.py": "scoreboard",
+    "litho_design/test_frozen_printer.py": "width scores window levels distance heights",
+    "litho_design/test_first.py": "matrix paired summary",
+}
 RECORD = {
     "name": "prints",
     "rows": [
@@ -36,6 +67,111 @@ TABLES = {
     "scan,ci95_nm\nP11,1.05 … 2.00\n": "row 0",
     ",scan\n0,P11\n1,P12\n": "without a name",
 }
+
+
+def test_the_meaning_of_a_column_stands_behind_its_name(tmp_path: Path) -> None:
+    page = Page("Rows", words={"mae_nm": ("error (nm)", "how far off")})
+    page.table([Row(scan="P11", mae_nm=1.5)], "All.", "rows.csv")
+    assert "<dt>error (nm)</dt><dd>how far off</dd>" in page.write(tmp_path).read_text()
+
+
+def test_every_table_of_the_product_is_held_by_a_law() -> None:
+    files = [file for name in ("data", "models", "design") for file in (ROOT / f"litho_{name}").rglob("*.py")]
+    written = re.compile(r'"([a-z_]+?)_?(?:\{[^"]*\})?\.csv"')
+    tables = {name for file in files for name in written.findall(file.read_text("utf-8"))}
+    assert tables == {name for names in HELD.values() for name in names.split()}
+    assert all((ROOT / "tests" / file).is_file() for file in HELD)
+
+
+def of_gratings(folder: Path) -> list[dict[str, Any]]:
+    scans = [
+        GratingScan(
+            id=name, period_um=1, line_um=2, scale_x=at + 0.3, scale_x_sd=at + 0.4, scale_y=at + 0.5,
+            scale_y_sd=at + 0.6, bow_um=at + 0.7, bow_sd_um=at + 0.8, tip_at_most_um=at + 0.9,
+            problem=f"of {name}",
+        )
+        for at, name in enumerate(("P1", "P2"))
+    ]  # fmt: skip
+    page = Page("Build")
+    of_build._gratings(page, scans)
+    page.write(folder)
+    return [one.model_dump() for one in scans]
+
+
+def of_a_build(folder: Path) -> list[dict[str, Any]]:
+    given: dict[str, Any] = {
+        "skipped": [LeftOut(id="P1", reason="torn")],
+        "unpaired": [LeftOut(id="P2", reason="no scan")],
+        "findings": [Finding(scan="P3", text="turned", weight=1)],
+    }
+    quality = {"scan": ["P4", "P5", "P6", "P7"], "warning": ["bent", "", "flat", "bent"]}
+    page = Page("Build")
+    of_build._left_out(page, BuildResult.model_construct(**given))
+    of_build._warnings(page, pd.DataFrame(quality))
+    page.write(folder)
+    return [
+        {"id": "P1", "status": "skipped", "reason": "torn"},
+        {"id": "P2", "status": "unpaired", "reason": "no scan"},
+        {"scan": "P3", "what": "turned"},
+        {"warning": "bent", "scan": "P4, P7"},
+        {"warning": "flat", "scan": "P6"},
+    ]
+
+
+def of_recipes(folder: Path) -> list[dict[str, Any]]:
+    left = {"plane": {"P1": 1.5, "P2": 2.5}, "bow": {"P1": 3.5, "P2": 4.5}}
+    write_suggestion(Suggestion("plane", left, {"bow": "moves lines"}, Path("card.toml")), {}, folder)
+    return [{"recipe": "plane", **left["plane"]}, {"recipe": "bow", **left["bow"], "warning": "moves lines"}]
+
+
+def of_a_sheet(folder: Path) -> list[dict[str, Any]]:
+    read = ReadSheet(
+        sheet_sha256="", dataset=DatasetId(name="made", sha256="0"), model="zoo:pbl", model_nm=9.5,
+        own_nm=8.5, corrected_nm=7.5, found=[], verdict="traced", measured_db={"without": 1.5, "with": 2.5},
+        expected_db={"without": 3.5, "with": 4.5},
+    )  # fmt: skip
+    write_sheet(folder, read)
+    said = {"expected": (3.5, 4.5), "measured": (1.5, 2.5)}
+    arms = ("without the model, dB", "with the model, dB")
+    return [
+        *({"image": kind, **dict(zip(arms, values, strict=True))} for kind, values in said.items()),
+        {"model": "zoo:pbl", "mae_nm": 9.5},
+        {"model": "physics, fitted to these prints", "mae_nm": 8.5},
+        {"model": "the same, with what the loop found", "mae_nm": 7.5},
+    ]
+
+
+def of_layouts(folder: Path) -> list[dict[str, Any]]:
+    shares: dict[str, Any] = {"level_share": [0.5, 0.3, 0.2], "jump_share": [0.6, 0.35, 0.05]}
+    bins: dict[str, Any] = {"frequency_per_um": [0.1, 0.2], "power_share": [0.7, 0.3]}
+    found = LayoutStatistics(count=1, levels=3, pitch_um=0.1, **shares, **bins)
+    np.save(folder / "P1.npy", np.eye(8, dtype=np.uint8))
+    statistics_page(found, [folder / "P1.npy"]).write(folder)
+    rows = enumerate(zip(*shares.values(), strict=True))
+    return [
+        {"level or jump": at, "share of pixels": level, "share of pairs": jump} for at, (level, jump) in rows
+    ]
+
+
+def test_graphs_of_layouts_show_shares_by_level_jump_and_frequency(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(Page, "figure", lambda page, figure, caption: shown.append(figure))
+    of_layouts(tmp_path)
+    levels, jumps, power = shown[-1].axes
+    assert [bar.get_height() for bar in levels.patches] == [0.5, 0.3, 0.2]
+    assert [bar.get_height() for bar in jumps.patches] == [0.6, 0.35, 0.05]
+    assert [[*one] for one in power.lines[0].get_data()] == [[0.1, 0.2], [0.7, 0.3]]
+
+
+@pytest.mark.parametrize("made", [of_gratings, of_a_build, of_recipes, of_a_sheet, of_layouts])
+def test_each_column_of_a_table_that_is_put_together_is_the_field_that_it_names(
+    made: Callable[[Path], list[dict[str, Any]]], tmp_path: Path
+) -> None:
+    """Each number and name of what is shown is another one."""
+    (tmp_path / "record.json").write_text(json.dumps({"rows": made(tmp_path)}))
+    require_tables_equal_record(tmp_path, "record.json", {})
 
 
 class Row(Record):

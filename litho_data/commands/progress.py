@@ -105,6 +105,13 @@ def never_silent(name: str) -> Iterator[None]:
 
 def say_estimate(what: str, seconds: float) -> None:
     """Print one line on stderr before anything that takes more than a minute."""
-    if seconds > _MINUTE_S:
-        span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
-        say(f"estimate: {what} takes about {span} more")
+    if told := estimate(what, seconds):
+        say(told)
+
+
+def estimate(what: str, seconds: float) -> str:
+    """The line of ``say_estimate``; empty for less than a minute."""
+    if seconds <= _MINUTE_S:
+        return ""
+    span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
+    return f"estimate: {what} takes about {span} more"

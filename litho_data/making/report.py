@@ -27,7 +27,7 @@ _MAX_SCANS_SHOWN = 48
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",
-    "raw": "cividis",
+    "raw ({unit})": "cividis",
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
@@ -84,7 +84,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and why; with `--strict` the build is refused instead"
+        caption = "Ids that are not in the store, and why; with --strict the build is refused instead"
         page.table(rows, caption, "left_out.csv")
 
 
@@ -133,13 +133,13 @@ def _pictures(page: Page, store: Store) -> None:
         page.note(f"The {len(ids)} scans with the lowest correlation with their layout, of {len(store)}.")
     stages = [_stages(store, scan_id) for scan_id in ids]
     columns, pictures = [], []
+    unit = "grey" if store.instrument == "sem" else "nm"
     for (title, colours), images in zip(_STAGES.items(), zip(*stages, strict=True), strict=True):
         low, high = _range(images, symmetric=colours == "RdBu_r")
-        columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
+        columns.append((f"{title.format(unit=unit)}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
         pictures.append([coloured_png(image, colours, low, high) for image in images])
     caption = (
-        "Raw: the scan in its own frame, nm (a micrograph: grey). Registered: on the layout's grid, empty "
-        "where not measured. "
+        "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
         "Residual: registered height minus the blurred layout, with the best gain and offset. "
         "One colour scale per column."
     )

@@ -196,7 +196,8 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
     )
     page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
     rows = [
-        {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
+        {"recipe": name, **of} | ({"warning": found.warned.get(name, "")} if found.warned else {})
+        for name, of in found.left_nm.items()
     ]
     caption = "Part of the levelled heights that the layout does not explain, root mean square, nm"
     page.table(rows, caption, "recipes.csv", digits=1)

@@ -198,7 +198,7 @@ def _to_um(values: Array, factor: float) -> Array:
 def _settle_pitch(file: Path, channel: Channel, size_um: YX | None, unit: str) -> YX | None:
     stated = channel.size_um or _size_of_extent(channel, unit)
     if size_um is not None:
-        if len(size_um) != 2 or not all(np.isfinite(size) and size > 0 for size in size_um):
+        if np.shape(size_um) != (2,) or not all(np.isfinite(size) and size > 0 for size in size_um):
             raise InputError(f"{file}: size_um", got=size_um, wanted="two positive numbers (y, x) in µm")
         if stated is not None and not np.allclose(size_um, stated, rtol=_SIZE_TOLERANCE, atol=0):
             raise InputError(f"{file}: size_um", got=size_um, wanted=f"{stated} as in the file, or none")

@@ -67,7 +67,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
     measured = np.isfinite(scan).astype(np.uint8) * 255
     scan_keys, scan_descriptors = detector.detectAndCompute(scan_image, measured)
     layout_keys, layout_descriptors = detector.detectAndCompute(layout_image, None)
-    if scan_descriptors is None or layout_descriptors is None:
+    if not (scan_keys and layout_keys):
         return None
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(layout_descriptors, scan_descriptors)
     if len(matches) < _FEWEST_MATCHES:
@@ -78,7 +78,8 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
     affine, inlier = cv2.estimateAffine2D(
         layout_points, scan_points, method=cv2.USAC_MAGSAC, ransacReprojThreshold=INLIER_PX, maxIters=5000
     )
-    if affine is None or not np.isfinite(affine).all():
+    # OpenCV gives None where its types promise a matrix.
+    if not np.isfinite(np.asarray(affine, dtype=float)).all():
         return None
     inlier = np.asarray(inlier).reshape(-1).astype(bool)
     if inlier.sum() < 3 or abs(np.linalg.det(affine[:, :2])) < 1e-3:

@@ -69,9 +69,11 @@ class PartialStore:
 
         self._pieces.mkdir(exist_ok=True)
         if self.store.exists():
-            for child in self.store.iterdir():
-                if child.name != "scans":
-                    shutil.rmtree(child) if child.is_dir() else child.unlink()
+            others = [one for one in self.store.iterdir() if one.name != "scans"]
+            # A stopped write of Zarr leaves a file of its own.
+            others += [one for one in (self.store / "scans").glob("*") if one.is_file()]
+            for child in others:
+                shutil.rmtree(child) if child.is_dir() else child.unlink()
         root = zarr.open_group(self.store, mode="a", zarr_format=3)
         # It exists already, because several processes add to it.
         root.require_group("scans")

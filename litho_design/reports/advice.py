@@ -34,9 +34,9 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("ssim", "SSIM {}", 3),
     ("si_psnr_window_db", "{} dB inside the signal window", 2),
     ("rms_nm", "{} nm rms from the relief", 1),
-    ("mae_direct", "MAE direct {}", 4),
-    ("mae_design", "MAE design {}", 4),
-    ("mae_calibrated", "MAE calibrated {}", 4),
+    ("mae_direct", "MAE {} on the sensor", 4),
+    ("mae_design", "MAE {} with the designed PSF", 4),
+    ("mae_calibrated", "MAE {} with the print's own PSF", 4),
 )
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # Reflection alone takes 4.6 %.
@@ -83,9 +83,9 @@ def width_sentence(design: Design) -> str:
     by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
     text = spread_sentence(width.figure, by_model, width.less, width.gain)
     text += f" The search used {width.searched_with} of them."
-    low, high = width.between
+    (low, high), (_, unit) = width.between, _parted(width.figure)
     if high > max(by_model.values()):
-        text += f" With the error that they had on their own prints, expect {low:.3g} to {high:.3g}."
+        text += f" With the error that they had on their own prints, expect {low:.3g} to {high:.3g}{unit}."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
@@ -101,8 +101,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     Args:
         less: whether the figure is better when lower; ``gain``: gain of the design over doing nothing.
     """
-    name, _, unit = named(figure).partition(" (")
-    unit = f" {unit.rstrip(')')}" if unit else ""
+    name, unit = _parted(figure)
     stated, *_ = by_model
     worst = (max if less else min)(by_model, key=by_model.__getitem__)
     text = (
@@ -112,8 +111,14 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     )
     apart = max(by_model.values()) - min(by_model.values())
     if gain is not None and apart > gain:
-        text += f" They disagree by {apart:.3g}{unit}, more than the {gain:.3g} gained over doing nothing."
+        text += f" They disagree by {apart:.3g}{unit}, more than the {gain:.3g}{unit} won by the design."
     return text
+
+
+def _parted(figure: str) -> tuple[str, str]:
+    """The name of a figure, and its unit after a blank; empty if it has none."""
+    name, _, unit = named(figure).partition(" (")
+    return name, f" {unit.rstrip(')')}" if unit else ""
 
 
 def thickness_warning(design: Design) -> str:

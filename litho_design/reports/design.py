@@ -180,9 +180,8 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
         f"{100 * PASS_SHARE:g} % of it{grown * bool(set(errors) & set(passed.figures))}. "
         f"Judged by {', '.join(map(named, passed.figures))}."
     )
-    labels = meanings(task.score_type)
     chosen = [name for name in task.headline if name in passed.figures][:2] or passed.figures[:2]
-    figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
+    figures = {name: (design.predicted[name], named(name)) for name in chosen}
     page.figure(
         yield_figure(draws, figures, errors), "Yield curves; the dashed line is the print as modelled."
     )

@@ -185,6 +185,7 @@ def benchmark(
     """
     from litho_models.evaluation.benchmark import DEFAULT_MODELS
     from litho_models.evaluation.tables import headline_table
+    from litho_models.evaluation.wording import benchmark_verdict
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
     settings = _training(set_, recipe=recipe, variant=variant, steps=steps)
@@ -209,6 +210,7 @@ def benchmark(
     scored = len(result.split.scored_ids)
     if scored < FEWEST_FOR_INTERVAL:
         typer.echo(f"no intervals: {scored} scans are too few, {FEWEST_FOR_INTERVAL} are needed")
+    typer.echo(benchmark_verdict(result))
     typer.echo(f"report {out / 'report.html'}")
 
 

@@ -129,7 +129,7 @@ def _one_scan(
 def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelScores]) -> None:
     page.heading("Phase, similarity, edges", folded=True)
     page.table(tables.metric_table(scores), "Means over scans.", "metrics.csv", digits=3)
-    page.paragraph(tables.metric_text())
+    page.paragraph(tables.metric_text(scores))
     page.heading("With other terms fitted", folded=True)
     page.table(
         tables.policy_table(scores, result.nuisance, result.noise_floor),
@@ -144,9 +144,9 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
     page.heading("By scan and by level", folded=True)
     page.table(tables.scan_table(scores), "By scan.", "scans.csv")
     page.table(tables.level_table(scores), "By level.", "levels.csv")
-    page.heading("Notes on these numbers", folded=True)
-    for note in said("notes", scores=scores):
-        page.paragraph(note)
+    if notes := said("notes", scores=scores):
+        page.heading("Notes on these numbers", folded=True)
+        page.points(notes)
 
 
 def lock_box_text(split: ScoredSplit) -> str:
@@ -155,5 +155,5 @@ def lock_box_text(split: ScoredSplit) -> str:
         return "The dataset is too small for locked scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
-        return f"Locked scans of the dataset, left out: {len(split.lock_box)}."
-    return f"Locked scans of the dataset are among the scored ones: {', '.join(scored)}."
+        return f"Locked scans, which no training on this dataset uses, are left out: {len(split.lock_box)}."
+    return f"Locked scans, which no training on this dataset uses, are scored too: {', '.join(scored)}."

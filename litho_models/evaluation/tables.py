@@ -98,7 +98,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: phase error, and all metrics of ``metric_registry``."""
-    keys = [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
+    keys = _measured(scores)
     return [
         {
             "model": s.model,
@@ -107,6 +107,10 @@ def metric_table(scores: Sequence[ModelScores]) -> Rows:
         }
         for s in scores
     ]
+
+
+def _measured(scores: Sequence[ModelScores]) -> list[str]:
+    return [m.key for m in registered_metrics() if any(s.metric(m.key) is not None for s in scores)]
 
 
 def scan_table(scores: Sequence[ModelScores]) -> Rows:
@@ -134,9 +138,9 @@ def interval_text(interval: Interval) -> str:
     return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
 
 
-def metric_text() -> str:
+def metric_text(scores: Sequence[ModelScores]) -> str:
     """Explain the columns of ``metric_table``."""
     return (
         f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
-        f"(index step {INDEX_STEP:g}). {metrics_text()}"
+        f"(index step {INDEX_STEP:g}). {metrics_text(_measured(scores))}"
     )

@@ -54,7 +54,7 @@ def dose(found: DoseMatrix) -> Figure:
             lw=1,
             label=f"{row.dose:.3g}",
         )
-    left.set(xlabel="level", ylabel="printed height above the lowest level, nm")
+    left.set(xlabel="level", ylabel="height above the lowest level, nm")
     left.legend(fontsize=8, title="dose", title_fontsize=8)
     right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
     right.axhline(READABLE_AT, color="#9aa7b5", ls="--", lw=1)

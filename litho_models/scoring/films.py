@@ -13,10 +13,10 @@ from litho_data.store import PrintedScan
 
 _LEAST_PX = 4
 FILMS_TEXT = (
-    "area_error is the difference of the predicted and the measured area of the film, without sign. Features "
-    "are connected parts of film or ground of at least four pixels: missing are measured ones without any "
-    "pixel in the prediction, extra are predicted ones without any in the measurement, merged counts films "
-    "that the prediction joins and the measurement does not, or the reverse."
+    "The area error is the difference of the predicted and the measured area of the film, without sign. "
+    "Features are connected parts of film or ground of at least four pixels: missing are measured ones "
+    "without any pixel in the prediction, extra are predicted ones without any in the measurement, merged "
+    "counts films that the prediction joins and the measurement does not, or the reverse."
 )
 
 

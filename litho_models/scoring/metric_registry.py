@@ -5,7 +5,7 @@ metrics are fields of the results; registered ones are listed under ``metrics``.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -112,9 +112,11 @@ def registered_metrics() -> list[Metric]:
     return [metric for measurement in _MEASUREMENTS for metric in measurement.metrics]
 
 
-def metrics_text() -> str:
-    """Explain the metrics in sentences."""
-    return " ".join(measurement.explanation for measurement in _MEASUREMENTS)
+def metrics_text(keys: Collection[str]) -> str:
+    """Explain the metrics of these keys in sentences."""
+    return " ".join(
+        one.explanation for one in _MEASUREMENTS if any(metric.key in keys for metric in one.metrics)
+    )
 
 
 def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> dict[str, Any]:

@@ -284,11 +284,14 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
         content = bytearray(damaged.read_bytes())
         content[len(content) // 2] ^= 1
         damaged.write_bytes(content)
+        # What a write of Zarr leaves that was stopped.
+        (partial.store / "scans" / "zarr.0123.partial").write_text("{")
     text = (own_campaign / "scans" / "P12.txt").read_text()
     (own_campaign / "scans" / "P12.txt").write_text(text.replace("\t", " ", 1))
     result = build_dataset(own_campaign / "card.toml", out)
     assert result.reused == 1
     assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
+    assert not list(out.rglob("*.partial"))
 
 
 def test_a_changed_card_is_another_piece(campaign: Path) -> None:

@@ -18,6 +18,7 @@ from litho_data.layouts import (
     layout_statistics,
     line_space_sweep,
     random_layout,
+    relative_doses,
     siemens_star,
     step_ladder,
     write_layout_set,
@@ -258,3 +259,7 @@ class TestLayoutSets:
         with pytest.raises(InputError, match="pattern"):
             write_layout_set(tmp_path / "set", pattern="spiral")
         assert not list(tmp_path.iterdir())
+
+
+def test_doses_of_a_matrix_are_even_about_that_of_the_recipe():
+    np.testing.assert_allclose(relative_doses(7), [0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3])

@@ -32,6 +32,7 @@ from litho_data.virtual_fab.geometry import sample_surface
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean
+from litho_data.virtual_fab.random_curves import line_roughness, perlin_curve
 from litho_data.virtual_fab.truth import noise_floor
 
 NO_KNOBS = KnobBoard((), 0)
@@ -308,3 +309,27 @@ class TestDeterminism:
             tracemalloc.stop()
         # Six more scans as arrays would be 6 × 256² × 8 bytes = 3 MB; their truth records are a few kB.
         assert peaks[1] - peaks[0] < 0.5e6
+
+
+class OnePoint:
+    """In place of white noise: what it becomes has the squares of all that white noise adds up."""
+
+    def standard_normal(self, shape):
+        point = np.zeros(shape)
+        point[shape[0] // 2, shape[1] // 3] = 1.0
+        return point
+
+
+@pytest.mark.parametrize("shape", [(24, 31), (25, 40)])
+def test_rough_lines_have_unit_variance_on_average_and_lie_along_x(shape):
+    spread = line_roughness(shape, 0.1, OnePoint())
+    assert np.square(spread).sum() == pytest.approx(1, rel=1e-9)
+    # Neighbours along a line are alike, those across it are not.
+    across, along = (float((spread * np.roll(spread, 1, axis)).sum()) for axis in (0, 1))
+    assert along > 0.8 > across
+
+
+def test_a_perlin_curve_is_zero_at_each_cell_and_never_beyond_one():
+    curve = perlin_curve(np.arange(0, 60, 0.125), 2.0, np.random.default_rng(0))
+    assert np.abs(curve[::16]).max() < 1e-12
+    assert 0.2 < np.abs(curve).max() <= 1

@@ -18,6 +18,7 @@ from litho_design.optimisation.process_window import disagreement_um
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, Design
+from litho_design.tasks.width import Width
 from litho_design.workflows.design import design_hologram, design_lens
 
 
@@ -142,3 +143,10 @@ def test_a_model_that_looks_at_the_whole_image_is_found_out():
     # Tiles away from the high corner normalise by half the height: 1 µm where the whole says 0.5 µm.
     check = Printer(Normalising(), layout, source="test").tiling_check(level, tile_px=64)
     assert check.max_nm == pytest.approx(500, rel=1e-5)
+
+
+def test_models_disagree_most_on_the_level_whose_heights_are_farthest_apart():
+    """Each height is counted from its own level 0."""
+    heights = {"one": [0.1, 0.3, 0.6, 0.7], "two": [0.5, 0.8, 1.4, 1.2]}
+    width = Width(searched_with=1, figures={}, returned="", figure="", less=False, level_heights_um=heights)
+    assert width.open_level == pytest.approx((2, 0.5, 0.9))

@@ -167,9 +167,11 @@ def test_printers_are_given_as_words_or_as_they_are(make_printer):
 def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeypatch):
     """And says how far they are apart: as stated, in the median and at worst."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
-    few = {"search.polish_rounds": 0, "window.yield_draws": 2, "window.defocus_sd_um": 0.5}
-    settings = hologram_settings(changes=changes | few)
-    known = {"judges": (), "announce": False}
+    spreads = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um")
+    steady = {f"window.{one}": 0.0 for one in spreads}
+    few = {"search.polish_rounds": 0, "window.yield_draws": 2}
+    settings = hologram_settings(changes=changes | few | steady)
+    known = {"judges": ("none",), "announce": False}
     design = design_hologram("ring", "zoo:physics", tmp_path / "design", settings=settings, **known)
     result = score(tmp_path / "design", tmp_path / "score")
     others = [one for one in JUDGES if one != "physics"]
@@ -179,6 +181,7 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeyp
     assert design.thick is not None
     prints = {"print": design.predicted, "print, thick element": design.thick, **(design.baselines or {})}
     require_figures_by_column(tmp_path / "design" / "scores.csv", prints)
+    require_figures_of_a_design(tmp_path / "design", design)
     judged = {one.judge.name: one.figures for one in result.scores}
     by_judge = {"physics (design)": design.predicted, **judged, **(result.baselines or {})}
     require_figures_by_column(tmp_path / "score" / "scores.csv", by_judge)
@@ -201,6 +204,26 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeyp
     foreign = design.printer.model_copy(update={"dataset_sha256": 64 * "f"})
     monkeypatch.setattr("litho_design.printers.source.load_printer", None)
     assert models_at_hand([foreign], settings.layout) == []
+
+
+def require_figures_of_a_design(folder, design):
+    """Its tables beside the scores: models, levels, draws, and the distance from the training layouts."""
+    tables = {name: pd.read_csv(folder / f"{name}.csv") for name in ("width", "levels", "window", "distance")}
+    named = tables["width"].set_index(["layout", "printed by"])
+    wanted = {(name, by): own for name, of in design.width.figures.items() for by, own in of.items()}
+    assert len(named) == len(wanted) > 2
+    for place, figures in wanted.items():
+        assert named.loc[place].dropna().to_dict() == pytest.approx(figures)
+    assert tables["levels"]["printed_um"].tolist() == pytest.approx(design.stroke.printed_height_um)
+    distance = design.out_of_distribution.model_dump(exclude={"flagged", "unusual"})
+    assert tables["distance"].loc[0, [*distance]].to_dict() == pytest.approx(distance)
+    extreme = np.isin(np.load(folder / "layout_level.npy"), (0, design.layout.levels - 1))
+    assert distance["extreme_level_share"] == pytest.approx(extreme.mean())
+    # A print that does not vary is the print as modelled; its loss is that of the search.
+    wanted = {"loss": design.polished_loss, **design.predicted}
+    assert len(tables["window"]) == 2
+    for draw in tables["window"].to_dict("records"):
+        assert draw == pytest.approx({name: wanted[name] for name in draw}, rel=1e-4)
 
 
 @pytest.mark.parametrize(

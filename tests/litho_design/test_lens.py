@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_design.images.targets import draw_target
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import CENTRE_UM, LensBench, RadialLensBench, centre_to_background, sensor_psf
-from litho_design.lenses.score import half_maximum_width_um, lens_score
+from litho_design.lenses.score import half_maximum_width_um, lens_score, mtf, mtf_at
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, blaze_efficiency
@@ -252,3 +252,17 @@ def test_ring_path_needs_rings(settings, make_printer, change, message):
     changed = settings.model_copy(update=change)
     with pytest.raises(InputError, match=message):
         lens_task(changed, make_printer(changed.layout))
+
+
+def test_an_mtf_between_two_samples_is_on_the_line_between_them():
+    """Of a spot that is wider along one axis: a mean of both, zero frequency first."""
+    y, x = np.meshgrid(*(np.arange(32) - 16.0,) * 2, indexing="ij")
+    psf, pitch_um = torch.from_numpy(np.exp(-(x**2) / 18 - y**2 / 4.5)), 0.2
+    curve = mtf(psf)
+    samples = [(curve[0, k] + curve[k, 0]) / 2 for k in range(4)]
+    for share in (0.0, 0.25, 0.75):
+        wanted = (1 - share) * samples[2] + share * samples[3]
+        assert mtf_at(psf, (2 + share) / (32 * pitch_um), pitch_um) == pytest.approx(float(wanted), rel=1e-9)
+    # Gaussian spots of 3 and 1.5 px have Gaussian transfers.
+    closed = [np.exp(-2 * (np.pi * sd * 2 / 32) ** 2) for sd in (3.0, 1.5)]
+    assert float(samples[2]) == pytest.approx(np.mean(closed), rel=1e-6)

@@ -23,6 +23,7 @@ def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tm
     assert "are too few, 6 are needed" in result.stdout
     assert " folds instead of 50: one for each scan" in result.stderr
     assert "…" not in result.stdout
+    assert result.stdout.splitlines()[-2].startswith("affine is")
 
 
 def test_a_result_without_end_is_refused_before_it_is_read():

@@ -358,6 +358,8 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
         next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]
     assert question.status == "decides"
+    named = [f"it is {name}" for name in question.rivals]
+    assert [one.rpartition(": ")[2] for one in question.outcomes[: len(named)]] == named
     assert question.power[0] <= question.power[1]
     assert load_card(tmp_path / "plan" / "card.toml").plan is not None
     jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pandas as pd
 import pytest
 
 from benchmarks import virtual_noise
@@ -37,12 +38,13 @@ def test_every_column_of_a_table_is_the_field_that_it_names(name: str, tmp_path:
     result = NoiseAnalysis.read(virtual_noise.FOLDER / name)
     write_noise_report(result, [], tmp_path)
     result.write(tmp_path)
-    require_tables_equal_record(
-        tmp_path,
-        NoiseAnalysis.FILE_NAME,
-        {},
-        pivoted=("calibration.csv", "calibration_scans.csv", "variance.csv"),
-    )
+    coverages = {"σ": "name"} | {f"coverage_{share}": "" for share in (50, 68, 80, 90, 95)}
+    named = {"calibration.csv": coverages, "calibration_scans.csv": coverages}
+    require_tables_equal_record(tmp_path, NoiseAnalysis.FILE_NAME, named, pivoted=["variance.csv"])
+    if result.spread is not None:
+        fitted = result.spread.variance
+        shown = dict(pd.read_csv(tmp_path / "variance.csv").itertuples(index=False))
+        assert shown == pytest.approx(dict(zip(fitted.covariates, fitted.coefficients, strict=True)))
 
 
 def test_each_coverage_stands_under_its_level() -> None:

@@ -156,7 +156,7 @@ def test_a_metric_of_one_s_own_is_in_results_tables_and_text(own_metrics):
     assert scores.metrics["never_um"] is None
     assert [row["worst_nm"] for row in metric_table([scores])] == [scores.metrics["worst_nm"]]
     assert [row["high"] for row in scan_table([scores])] == [row["high"] for row in rows]
-    assert "worst is the largest." in metric_text()
+    assert "worst is the largest." in metric_text([scores])
     assert ModelScores.model_validate_json(scores.model_dump_json()) == scores
 
 
