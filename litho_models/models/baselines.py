@@ -1,7 +1,5 @@
 """Baselines that every model must beat, from the layout itself to linear features in closed form."""
 
-from typing import ClassVar
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -47,7 +45,7 @@ class Affine(Simulator):
 
 
 class BlurTableConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigma_max_um", "sigma_init_um")
+    LENGTHS = ("sigma_max_um", "sigma_init_um")
 
     sigma_max_um: float = Field(1.0, gt=0, description="upper bound of the blur, µm")
     sigma_init_um: float = Field(0.25, gt=0, description="blur before fitting, µm")
@@ -85,7 +83,7 @@ class BlurTable(Simulator):
 
 
 class AffineMtfConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um",)
+    LENGTHS = ("sigmas_um",)
 
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8), min_length=1)
 
@@ -131,7 +129,7 @@ def blurred_interior(
 
 
 class LinearConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um", "power_sigma_um")
+    LENGTHS = ("sigmas_um", "power_sigma_um")
 
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0), min_length=1)
     power_sigma_um: float = 0.25

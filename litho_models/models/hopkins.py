@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
@@ -73,7 +74,7 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
     return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
 
 
-def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
+def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> Array:
     """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
 
     Source points lie on the grid of the field's frequencies, each weighted by the filled share of its cell.
@@ -103,7 +104,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     return found.reshape(count, *shape)
 
 
-def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics) -> np.ndarray:
+def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
     """Share of the cells (y, x) around frequencies, relative to the pupil, that the source fills."""
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
@@ -114,7 +115,7 @@ def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics)
     return filled / _COUNTED**2
 
 
-def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
+def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
     """Amplitude that passes the pupil, with the phase of a defocus."""
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,13 +60,11 @@ class Part:
     """A stage of a printer.
 
     Attributes:
-        name, stage: its name, and the stage at which it acts.
         numbers: parameters by name, see ``Number``; ``source``: source of the formula.
         apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
     name: str
-    stage: Literal["illumination", "resist", "diffusion", "shrinkage", "transfer"]
     numbers: Mapping[str, Number]
     apply: Apply
     source: str
@@ -184,7 +182,7 @@ def kernels_part(name: str, file: str | Path) -> Part:
     def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
         return imaged_inside(pattern, spectra(*pattern.shape[-2:]), size_px // 2)
 
-    return Part(name, "illumination", {}, apply, Path(file).name, lambda *_: size_px // 2)
+    return Part(name, {}, apply, Path(file).name, lambda *_: size_px // 2)
 
 
 _SIGMA = {"sigma_um": Number(0.2, "µm")}
@@ -204,7 +202,7 @@ _CHANG = "sum of Gaussians: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)"
 
 
 def _illumination(name: str, numbers: Mapping[str, Number]) -> Part:
-    return Part(name, "illumination", numbers, _by_spots, _CHANG, _spot_reach_px)
+    return Part(name, numbers, _by_spots, _CHANG, _spot_reach_px)
 
 
 PARTS = {
@@ -215,7 +213,6 @@ PARTS = {
         _illumination("three-spots", {**_SIGMA, **_BACK, **_BETWEEN}),
         Part(
             "lens",
-            "illumination",
             _STATED,
             lambda pattern, values, pitch: intensity(pattern, _optics(values), pitch),
             "partially coherent imaging: Hopkins, Proc. R. Soc. A 217, 408 (1953)",
@@ -223,34 +220,29 @@ PARTS = {
         ),
         Part(
             "tanh",
-            "resist",
             _CONTRAST,
             lambda dose, values, pitch: project(dose, values["contrast"], values["threshold"]),
             "projection of Wang et al. 2011, doi:10.1007/s00158-010-0602-y",
         ),
         Part(
             "hill",
-            "resist",
             _CONTRAST,
             lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
             "share that a dose converts, one half at the threshold",
         ),
         Part(
             "contrast-curve",
-            "resist",
             {"contrast": Number(1.5), "clearing": Number(0.9, upper=3.0)},
             lambda dose, values, pitch: contrast_curve(dose, values["contrast"], values["clearing"]),
             "depth by the logarithm of the dose: Mack, Fundamental Principles of Optical Lithography, 2007",
         ),
         Part(
             "inverted",
-            "resist",
             {},
             lambda resist, values, pitch: 1 - resist,
             "a positive resist remains where a negative one is removed; an imprint inverts its master",
         ),
         Part(
-            "diffusion",
             "diffusion",
             {"sigma_um": Number(0.1, "µm")},
             _diffuse,
@@ -259,7 +251,6 @@ PARTS = {
         ),
         Part(
             "shrinkage",
-            "shrinkage",
             {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
             _shrink,
             "less height where less is exposed around: arXiv:2309.17343, parameterized physics model",
@@ -267,14 +258,12 @@ PARTS = {
         ),
         Part(
             "etch",
-            "transfer",
             {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
             lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
             "a film that stays under the resist, its edge moved by a bias",
             lambda values, pitch: 1,
         ),
         Part(
-            "transfer",
             "transfer",
             {"selectivity": Number(1.0)},
             lambda resist, values, pitch: values["selectivity"] * resist,

@@ -8,6 +8,7 @@ network (shrinkage), areawise network (everything else).
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self, cast
 
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_data.foundation.errors import require_known
-from litho_models.layers.gaussian import Edge, Sigma, Support, gaussian_blur, supported_radius_px
+from litho_models.layers.gaussian import Edge, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
@@ -34,7 +35,7 @@ Channels = Annotated[int, Field(ge=1, le=1024)]
 
 
 class PblConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         "sigma_optical_um",
         "sigma_diffusion_max_um",
         "sigma_diffusion_init_um",
@@ -111,8 +112,8 @@ class PblConfig(SimulatorConfig):
             part = self.exposing
             for name in self.numbers:
                 require_known(f"number of {part.name}", name, part.numbers)
-            if part.stage != "illumination" or self.edge == "zero":
-                raise ValueError("wanted a part that exposes as illumination, and edge 'replicate'")
+            if self.edge == "zero":
+                raise ValueError("illumination takes edge 'replicate'")
         return self
 
 
@@ -208,8 +209,13 @@ class Pbl(Simulator):
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
         """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
         optical, diffusion = self._radii_px()
-        initial = self._threshold(self._exposed(layout_um, optical, edge))
-        dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
+        blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
+        if self.config.illumination is None:
+            exposed = blur(layout_um, self.config.sigma_optical_um, radius_px=optical)
+        else:
+            exposed = self._exposed(layout_um)
+        initial = self._threshold(exposed)
+        dose = blur(initial, self.sigma_diffusion_um, radius_px=diffusion)
         if edge is None:
             return self._develop(crop_border(initial, diffusion), dose)
         return self._develop(initial, dose, padding=1)
@@ -224,15 +230,9 @@ class Pbl(Simulator):
             optical = config.exposing.reach_px(config.exposing_values, self.pitch_um)
         return optical, diffused
 
-    def _exposed(self, layout_um: Tensor, radius_px: int, edge: Edge | None) -> Tensor:
+    def _exposed(self, layout_um: Tensor) -> Tensor:
         config, full_um = self.config, self.config.full_height_um
-        if config.illumination is None:
-            return self._blur(layout_um, config.sigma_optical_um, radius_px, edge)
-        dose = config.exposing.apply(layout_um / full_um, config.exposing_values, self.pitch_um)
-        return full_um * dose
-
-    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
-        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
+        return full_um * config.exposing.apply(layout_um / full_um, config.exposing_values, self.pitch_um)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um

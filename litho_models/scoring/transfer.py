@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
@@ -25,13 +25,11 @@ class LevelError(Record):
     sd_nm: float
 
 
-class TransferCurves(Record):
+class TransferCurves(Record, extra="ignore"):
     """Prediction against measurement per frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
 
     ``error_psd``: one-sided density of the error's power along lines, nm² per cycle/µm, line means removed.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     frequency_per_um: list[float]
     gain_x: list[float]

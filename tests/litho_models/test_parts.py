@@ -230,7 +230,7 @@ def test_every_part_states_its_source_and_numbers_within_their_range() -> None:
 def test_a_part_of_ones_own_is_a_stage_of_a_printer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
     numbers = {"gain": Number(0.5)}
-    register_part(Part("gain", "transfer", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
+    register_part(Part("gain", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
     model = printer("laser-writer", parts=("spot", "gain"))
     assert set(model.values) == {"spot.sigma_um", "gain.gain"}
     flat = torch.full((1, 1, 40, 40), 0.8)
@@ -251,8 +251,8 @@ def test_pbl_begins_as_the_image_of_any_illumination() -> None:
         "projection", parts=("lens",), **{f"lens.{key}": value for key, value in numbers.items()}
     )
     torch.testing.assert_close(pbl(layout), bare(layout), rtol=0, atol=1e-5)
-    for wrong in ({"illumination": "etch"}, {"illumination": "lens", "numbers": {"sigma_um": 1}}):
-        with pytest.raises(InputError, match=r"illumination|sigma_um"):
+    for wrong in ({"illumination": "lamp"}, {"illumination": "lens", "numbers": {"sigma_um": 1}}):
+        with pytest.raises(InputError, match=r"lamp|sigma_um"):
             build_model("pbl", **wrong)
 
 
