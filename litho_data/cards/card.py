@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.files import parsed
+from litho_data.foundation import InputError, parsed, um_per, unknown_name
 from litho_data.foundation.names import PlainName
 from litho_data.foundation.quantities import LENGTH_UM, Levels
 from litho_data.foundation.results import Record, first_error
-from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 

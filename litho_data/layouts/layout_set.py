@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.commands.progress import progress
+from litho_data.foundation import Array, Shape, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import require_known
-from litho_data.foundation.kinds import Array, Shape
 from litho_data.foundation.quantities import LEVELS
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import (

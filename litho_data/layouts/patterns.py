@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
 
 
 def flat(shape: Shape, *, level: int) -> Array:

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
 from litho_data.foundation.quantities import LEVELS
 
 PASSBANDS = ("square", "round")

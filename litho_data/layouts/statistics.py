@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Result
 
 _FEWEST_PX = 64

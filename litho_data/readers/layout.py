@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.exported import export_of, exported_levels
 from litho_data.readers.picture import read_picture, value_range
 from litho_data.readers.registry import require_file

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, array_sha256, record_sha256
 from litho_data.register.bend import Bend
 
 
@@ -51,7 +50,7 @@ class PrintedScan:
     level_height_um: float
     levels: int
     scan_to_layout: Array
-    write: Mapping[str, Any] | None = None
+    write: Facts | None = None
     field_x_um: float | None = None
     field_y_um: float | None = None
     dose: float | None = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Facts, Shape
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     MIXED_UNITS,
@@ -63,7 +63,7 @@ def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
 
 def write_samples(
     root: zarr.Group,
-    scans: Sequence[Mapping[str, Any]],
+    scans: Sequence[Facts],
     load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
@@ -134,7 +134,7 @@ def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str)
 
 
 def write_numbers(
-    group: zarr.Group, name: str, values: Array, dim: str, attributes: Mapping[str, Any] | None = None
+    group: zarr.Group, name: str, values: Array, dim: str, attributes: Facts | None = None
 ) -> None:
     """A one-dimensional array of numbers."""
     _write(group, name, values, dim, values.dtype, attributes=dict(attributes or {}))

@@ -16,9 +16,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, zoom
 
 from litho_data.commands.progress import progress
+from litho_data.foundation import Array, InputError, Shape, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
 from litho_data.foundation.results import Result
 from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
