@@ -5,6 +5,7 @@ layout".
 import numpy as np
 
 from litho_data.foundation import Array, InputError, Shape, require_known
+from litho_data.foundation.quantities import LEVELS
 
 PASSBANDS = ("square", "round")
 QUANTISERS = ("round", "floor")
@@ -26,8 +27,8 @@ def random_layout(
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the nearest of
     ``levels`` values. The result is periodic in both directions. The paper does not define the low-pass
     filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) and ±0.5
-    cycles/µm (prints 6 and 7). The measured layouts were cut from a larger field, and their levels were
-    truncated, not rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
+    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated, not
+    rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.
@@ -42,14 +43,13 @@ def random_layout(
             and it may lack the lowest or the highest level. None: the layout is the field.
 
     Returns:
-        uint8, shape (ny, nx).
+        uint8 (beyond 256 levels uint16), shape (ny, nx).
 
     Raises:
-        InputError: fewer than 2 or more than 256 levels, a cut-off that leaves nothing to vary, or a field
+        InputError: fewer than 2 or more than 65536 levels, a cut-off that leaves nothing to vary, or a field
             smaller than the layout.
     """
-    if not 2 <= levels <= 256:
-        raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    LEVELS.require("levels of a layout", levels)
     whole = shape if field_px is None else (field_px, field_px)
     if field_px is not None and field_px < max(shape):
         raise InputError("field_px of a random layout", got=field_px, wanted=f"at least {max(shape)}")
@@ -96,8 +96,7 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Round values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the integer below;
-    uint8.
-    """
+    """Round values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the integer below."""
     require_known("quantiser", quantiser, QUANTISERS)
-    return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)
+    whole = np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round"))
+    return whole.astype(np.min_scalar_type(levels - 1))

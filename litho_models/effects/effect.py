@@ -175,7 +175,7 @@ class Effect:
             of its ``tried`` values, in each shape.
         source: source of the formula.
         separating: experiment that separates this effect from similar effects.
-        needs: facts about the print that a test of this effect requires.
+        needs: what a test of the effect requires: a known order of the scans, or a microscope with a probe.
         reverses: parameters with the opposite sign on retrace lines.
         of_tip: whether a new tip removes this effect.
         of_films: whether this effect moves the edges of a film seen from above; other effects change heights.
@@ -192,7 +192,7 @@ class Effect:
     source: str
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
-    needs: tuple[Literal["order"], ...] = ()
+    needs: tuple[Literal["order", "probe"], ...] = ()
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
     of_films: bool = False

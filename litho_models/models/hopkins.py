@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -55,12 +56,16 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     kernels' reach.
     """
     reach = kernel_reach_px(optics, pitch_um)
-    ny, nx = transmission.shape[-2:]
-    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
+    spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
+    return imaged_inside(transmission, spectra, reach)
+
+
+def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
+    """Image a mask that is not periodic; return the intensity without the outermost ``reach_px``."""
     # Transforms spread rounding errors over the field. Double precision keeps the result in tiles equal to
     # that of the whole field.
-    image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
-    return image.to(transmission.dtype)
+    image = imaged(transmission.double(), spectra.to(transmission.device))
+    return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
 
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
@@ -127,11 +132,17 @@ def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Return the transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
+    """Return the spectra (``spectra_of``) of a lens's kernels, which are no larger than ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
+    return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)
+
+
+def spectra_of(kernels: np.ndarray, ny: int, nx: int) -> Tensor:
+    """Return the transfer functions (k, ny, nx) of kernels (k, size, size) around their middle pixel."""
+    size_px = kernels.shape[-1]
     reach = size_px // 2
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
-    placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
+    placed[:, :size_px, :size_px] = kernels
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
     # An open mask has intensity 1 for any number of kernels.
     spectra = np.fft.fft2(placed)
