@@ -48,8 +48,8 @@ FITTED_EVERY = 2
 LEARNED: dict[str, dict[str, int]] = {
     "features": {},
     "random-features": {},
-    "pbl": {"steps": 60, "rounds": 1},
-    "fno": {"steps": 150, "rounds": 1},
+    "pbl": {},
+    "fno": {"steps": 300, "rounds": 1, "validation_scans": 0},
 }
 AROUND_PX = 40
 Row = dict[str, Any]

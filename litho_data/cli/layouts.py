@@ -33,7 +33,7 @@ def masks(
     pattern: Annotated[str, option("random, or a calibration pattern: see --list-patterns")] = "random",
     count: Annotated[int, option("number of random layouts", min=1)] = 12,
     size_px: Annotated[int, option("side of a layout", min=8)] = 512,
-    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=256)] = 13,
+    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=65536)] = 13,
     cutoff_per_um: Annotated[float, option("low-pass cut-off, cycles/µm")] = 0.25,
     passband: Annotated[str, option("square (as the measured layouts) or round")] = "square",
     quantiser: Annotated[

@@ -76,7 +76,7 @@ def _toml(table: Facts) -> str:
 
 
 def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
-    """Write one layout as an 8-bit TIFF of level numbers."""
+    """Write one layout as a TIFF of level numbers."""
     import tifffile
 
     path = folder / "layouts" / f"{scan_id}.tif"

@@ -43,7 +43,7 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
     """Collect the statistics of layouts, one at a time.
 
     Args:
-        layouts: uint8 levels (ny, nx), or paths of layout files.
+        layouts: levels (ny, nx), or paths of layout files.
         levels: number of levels L.
         pitch_um: pixel pitch, µm.
 

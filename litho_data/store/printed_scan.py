@@ -17,7 +17,7 @@ class PrintedScan:
 
     Args:
         id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
-        mask_level: layout levels, uint8 (ny, nx).
+        mask_level: layout levels, uint8 (beyond 256 levels uint16), (ny, nx).
         height_um: float32 (ny, nx), µm, NaN where not measured.
         valid: bool (ny, nx), measured and inside the scan.
         pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.

@@ -160,7 +160,8 @@ class Store:
             InputError: a stored chunk that does not decode.
         """
         what = f"{name} of scan {self.ids[row]} in {self.path}"
-        values = decoded(self._arrays[name], row, what).astype(VARIABLES[name].dtype, copy=False)
+        values = decoded(self._arrays[name], row, what)
+        values = values.astype(VARIABLES[name].stored_as(values), copy=False)
         if name == "scan_to_layout":
             return values
         ny, nx = self.shapes[row]

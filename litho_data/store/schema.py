@@ -17,22 +17,30 @@ WRITE = "write_"
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name."""
+    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name.
+
+    ``wider``: the type where ``dtype`` does not hold all values.
+    """
 
     name: str
     dims: tuple[str, ...]
     dtype: str
     unit: str
     long_name: str
+    wider: str = ""
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
         """The dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
+    def stored_as(self, sample: Array) -> str:
+        """The type in the store of values like these."""
+        return self.wider if str(sample.dtype) == self.wider else self.dtype
+
     def sample_sha256(self, sample: Array) -> str:
         """Hash of one scan's slice in its true shape, so padding and chunking do not matter."""
-        return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
+        return array_sha256(np.asarray(sample, dtype=self.stored_as(sample)), self.unit, self.sample_dims)
 
 
 class DatasetId(Record):
@@ -62,9 +70,9 @@ OPTIONAL_COLUMNS = {
     "pixel_size": Range(1e-3, 1e3),
 }
 """Numbers per scan from the card's table with their ranges; coordinates, NaN where a row has none."""
-Instrument = Literal["afm", "sem"]
-"""What heights are: measured by an atomic force microscope (``afm``), or a film's height times its coverage
-of a pixel, from the edges in an electron micrograph (``sem``)."""
+Instrument = Literal["afm", "profilometer", "confocal", "sem"]
+"""What heights are: measured by a probe (``afm``, ``profilometer``), by light (``confocal``), or a film's
+height times its coverage of a pixel, from the edges in an electron micrograph (``sem``)."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""

@@ -9,6 +9,8 @@ from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
+_MOST_KNOTS = 33
+
 
 class Identity(Simulator):
     """H = M; nothing to fit."""
@@ -50,7 +52,7 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), T linear between one free height per level."""
+    """H = T(G_σ * M), T linear between free heights: one per level, or 33 evenly spaced ones."""
 
     name = "blur-table"
     Config = BlurTableConfig
@@ -59,7 +61,8 @@ class BlurTable(Simulator):
     def __init__(self, config: BlurTableConfig):
         super().__init__(config)
         self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_init_um))
-        self.table_um = nn.Parameter(torch.arange(config.levels) * config.level_height_um)
+        knots = min(config.levels, _MOST_KNOTS)
+        self.table_um = nn.Parameter(torch.arange(knots) * (config.full_height_um / (knots - 1)))
 
     @property
     def ranges(self) -> dict[str, Range]:

@@ -6,16 +6,20 @@ Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError, damaged, require_known
+from litho_data.readers.registry import require_file
 from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.ranges import Range
-from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
+from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
 # Change of the resist between pixels below which no edge exists.
@@ -151,6 +155,36 @@ def _optics(values: Values) -> Optics:
     return Optics(**{**values, "kernels": int(values["kernels"])})
 
 
+def _shrink(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
+    remaining = values["kappa_min"] + (1 - values["kappa_min"]) * _diffuse(resist, values, pitch_um)
+    return crop_border(resist, spot_radius_px(values["sigma_um"], pitch_um)) * remaining
+
+
+def kernels_part(name: str, file: str | Path) -> Part:
+    """Illumination by the coherent kernels in an NPY file: Σ_k |h_k * M|², 1 for an open mask.
+
+    Args:
+        name: name of the part.
+        file: real or complex (k, size, size) at the layout's pitch, around the middle pixel of an odd size.
+
+    Raises:
+        InputError: no such file, or another array.
+    """
+    with damaged(f"kernels {file}"):
+        kernels = np.load(require_file(file), allow_pickle=False)
+        size_px = kernels.shape[-1]
+        odd = kernels.ndim == 3 and kernels.shape[1] == size_px and size_px % 2
+        if not odd or not np.isfinite(kernels).all():
+            got = f"{kernels.dtype} {kernels.shape}"
+            raise InputError(f"kernels {file}", got=got, wanted="numbers (k, size, size) of an odd size")
+    spectra = lru_cache(maxsize=2)(partial(spectra_of, kernels))
+
+    def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
+        return imaged_inside(pattern, spectra(*pattern.shape[-2:]), size_px // 2)
+
+    return Part(name, {}, apply, Path(file).name, lambda *_: size_px // 2)
+
+
 _SIGMA = {"sigma_um": Number(0.2, "µm")}
 _BACK = {"back_um": Number(0.6, "µm"), "back_share": Number(0.2, upper=0.9)}
 _BETWEEN = {"between_um": Number(0.4, "µm"), "between_share": Number(0.1, upper=0.9)}
@@ -213,6 +247,13 @@ PARTS = {
             {"sigma_um": Number(0.1, "µm")},
             _diffuse,
             "Gaussian spread of the reaction products",
+            lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
+        ),
+        Part(
+            "shrinkage",
+            {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
+            _shrink,
+            "less height where less is exposed around: arXiv:2309.17343, parameterized physics model",
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
+from litho_data.foundation.errors import require_known
 from litho_models.layers.gaussian import Edge, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
@@ -27,6 +28,7 @@ from litho_models.models.feature_networks import (
     ScanAxisConfig,
     Surroundings,
 )
+from litho_models.models.parts import Part, part_of
 from litho_models.simulator import Simulator, SimulatorConfig, Variant, crop_border, scaled_lengths
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
@@ -40,6 +42,8 @@ class PblConfig(SimulatorConfig):
     )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
+    illumination: str | None = Field(None, description="part of a printer in place of this spot: lens, …")
+    numbers: dict[str, float] = Field({}, description="values in place of the illumination's own")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
     # Wider than the areawise network sees (0.5 µm), so the blur starts where no other part can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
@@ -90,10 +94,26 @@ class PblConfig(SimulatorConfig):
         }
         return config.model_copy(update=scaled)
 
+    @property
+    def exposing(self) -> Part:
+        """The illumination in place of the spot."""
+        return part_of(self.illumination or "spot")
+
+    @property
+    def exposing_values(self) -> dict[str, float]:
+        """Its values by name."""
+        return {name: self.numbers.get(name, own.start) for name, own in self.exposing.numbers.items()}
+
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
         if self.edge == "zero" and (self.surroundings or self.scan_axis):
             raise ValueError("surroundings and scan_axis take edge 'replicate'")
+        if self.illumination is not None:
+            part = self.exposing
+            for name in self.numbers:
+                require_known(f"number of {part.name}", name, part.numbers)
+            if self.edge == "zero":
+                raise ValueError("illumination takes edge 'replicate'")
         return self
 
 
@@ -190,7 +210,11 @@ class Pbl(Simulator):
         """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
         optical, diffusion = self._radii_px()
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
-        initial = self._threshold(blur(layout_um, self.config.sigma_optical_um, radius_px=optical))
+        if self.config.illumination is None:
+            exposed = blur(layout_um, self.config.sigma_optical_um, radius_px=optical)
+        else:
+            exposed = self._exposed(layout_um)
+        initial = self._threshold(exposed)
         dose = blur(initial, self.sigma_diffusion_um, radius_px=diffusion)
         if edge is None:
             return self._develop(crop_border(initial, diffusion), dose)
@@ -202,7 +226,13 @@ class Pbl(Simulator):
             supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
             for sigma in (config.sigma_optical_um, diffusion)
         )
+        if config.illumination is not None:
+            optical = config.exposing.reach_px(config.exposing_values, self.pitch_um)
         return optical, diffused
+
+    def _exposed(self, layout_um: Tensor) -> Tensor:
+        config, full_um = self.config, self.config.full_height_um
+        return full_um * config.exposing.apply(layout_um / full_um, config.exposing_values, self.pitch_um)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,8 @@ from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.statistics import Interval, OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
-LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+LEADING: dict[Instrument, str] = dict.fromkeys(get_args(Instrument), "mae_datum_free_nm")
+LEADING["sem"] = "edge_mean_nm"
 """The error by which models are ranked and compared, by the instrument."""
 
 

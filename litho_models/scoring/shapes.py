@@ -18,7 +18,7 @@ SSIM_RANGE_UM = 1.2
 SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
-_CANDIDATES = 8
+_CANDIDATES, _MOST_HEIGHTS = 8, 24
 # Half the longest piece of a contour, the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
@@ -131,8 +131,9 @@ def edge_placement(
 
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
-    """Heights half way between neighbouring nominal levels, (levels - 1,) µm."""
-    return np.arange(0.5, levels - 1, dtype=np.float64) * level_height_um
+    """Heights half way between neighbouring nominal levels, µm; of many levels 24 evenly spaced ones."""
+    steps = min(levels - 1, _MOST_HEIGHTS)
+    return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)
 
 
 def _contour(map_um: Array, height_um: float) -> _Contour:

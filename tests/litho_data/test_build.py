@@ -180,6 +180,24 @@ def test_smaller_layouts_are_padded_and_cut_again(tmp_path: Path) -> None:
     assert verify(tmp_path / "prints.zarr").findings == ()
 
 
+def test_levels_beyond_a_byte_come_back(tmp_path: Path) -> None:
+    levels = 3001
+    card = write_campaign(tmp_path, count=2, shape=(112, 112))
+    written = card.read_text(encoding="utf-8").replace("levels = 13", f"levels = {levels}")
+    card.write_text(written.replace("level_height_um = 0.1", f"level_height_um = {1.2 / (levels - 1)}"))
+    layouts = {f"P1{1 + at}": layout_of(at).astype(np.uint16) * 250 for at in range(2)}
+    for scan_id, level in layouts.items():
+        tifffile.imwrite(tmp_path / "layouts" / f"{scan_id}.tif", level)
+    build_dataset(card, tmp_path / "prints.zarr")
+    store = open_store(tmp_path / "prints.zarr")
+    for scan_id, level in layouts.items():
+        scan = store.scan(scan_id)
+        np.testing.assert_array_equal(scan.mask_level, level)
+        assert scan.mask_level.dtype == np.uint16
+        assert np.abs((scan.height_um - scan.layout_um)[scan.usable]).mean() < 0.1
+    assert verify(tmp_path / "prints.zarr").findings == ()
+
+
 def test_references_are_kept_apart_from_the_dataset(tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=1, more='table = "scans.csv"')
     (tmp_path / "scans.csv").write_text("id,use\nP11,dataset\nbare,substrate\n", encoding="utf-8")
