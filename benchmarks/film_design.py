@@ -39,7 +39,7 @@ PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
 DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
 # Beyond the design nothing is written, which the pattern does not say of its surroundings.
 RIM_PX = 24
-PICTURE = """![Corrected layout; the film that is wanted, and edges of both prints](results/second-machine/design.png)
+PICTURE = """![Corrected layout; wanted film and edges of both prints](results/second-machine/design.png)
 
 *The corrected layout (grey: part of the dose), and the edges that `blur-table` predicts for both layouts.*"""
 
