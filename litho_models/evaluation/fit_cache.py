@@ -61,7 +61,7 @@ class FitRecord(FitFacts):
 
 
 def fit_or_load(
-    name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
+    name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool
 ) -> tuple[FitRecord, list[np.ndarray]]:
     """Return a fit and its heights (ny, nx) of the held-out scans, µm, from the cache or newly fitted.
 
