@@ -3,7 +3,7 @@
     python -m benchmarks.corrections --out runs/corrections [--publish]
 
 Five reliefs, printed by three virtual fabs with the effects of the design gap, which no model has, and by a
-model of the zoo. Physics and the blur with a table correct: for a fab trained on scans of its prints, for the
+model of the zoo. Three models of different form correct: for a fab trained on scans of its prints, for the
 measured prints those of the zoo, which PBL judges. Beside each correction stand the two layouts that need
 none: nominal heights, and the best gain and zero, chosen by the models of the search and, as nobody can
 before the print, by the judge itself. An interrupted run resumes.
@@ -38,8 +38,9 @@ RESULT = PAGE.parent / "results" / "corrections" / "corrections.json"
 NAME = "corrections"
 RELIEFS = ("cap", "freeform", "blaze", "staircase", "lens")
 # Announced before any of these fabs had printed.
-SEEDS = (72, 73, 74)
-FAB_MODELS, ZOO_MODELS, ZOO_JUDGE = ("physics", "blur-table"), ("zoo:physics", "zoo:blur-table"), "zoo:pbl"
+SEEDS = (75, 76, 77)
+FAB_MODELS = ("physics", "blur-table", "linear")
+ZOO_MODELS, ZOO_JUDGE = tuple(f"zoo:{name}" for name in FAB_MODELS), "zoo:pbl"
 SCANS, SCAN_PX, SIZE_PX, POLISH = 6, 128, 128, 40
 COLUMNS = {
     "uncorrected": "nominal",

@@ -17,6 +17,7 @@ from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
 from litho_data.commands.progress import run_script
 from litho_data.reports.pictures import new_figure
+from litho_models.effects.laws import TABLES
 from litho_models.loop.record import CloseLoop, ErrorRow, FoundEffect
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def causes_table(result: CloseLoop) -> str:
         ["added", "by", "size (95 % over prints)", "error without it", "scans better", "or", "also on"],
         [
             [
-                f"`{one.name}`",
+                f"`{one.name}`{' (described)' if one.knowledge == 'description' else ''}",
                 one.by,
                 "<br>".join(_sizes(one)),
                 "–" if one.left_out_nm is None else f"{one.left_out_nm:+.2f} nm",
@@ -88,7 +89,7 @@ def causes_table(result: CloseLoop) -> str:
                 ", ".join(one.survives_on) or "–",
             ]
             for one in result.effects
-            if one.knowledge != "description"
+            if one.name not in TABLES
         ],
     )
 

@@ -22,7 +22,7 @@ from litho_data.commands.progress import progress, run_script
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.pictures import new_figure
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.fitting.fit import common_geometry, fit_with_record
+from litho_models.fitting.fit import common_geometry, fit
 from litho_models.fitting.runs import training_config
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.loop.record import CloseLoop
@@ -48,8 +48,8 @@ FITTED_EVERY = 2
 LEARNED: dict[str, dict[str, int]] = {
     "features": {},
     "random-features": {},
-    "pbl": {"steps": 60, "rounds": 1},
-    "fno": {"steps": 150, "rounds": 1},
+    "pbl": {},
+    "fno": {"steps": 300, "rounds": 1, "validation_scans": 0},
 }
 AROUND_PX = 40
 Row = dict[str, Any]
@@ -123,7 +123,7 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
     geometry = common_geometry(fold.training)
     if name in LEARNED:
         config = training_config("fast", name, {"nuisance": "none", **LEARNED[name]})
-        model = fit_with_record(name, fold.training, config).model
+        model = fit(name, fold.training, config).model
     else:
         fits = []
         for start in ({}, started(bare)) if bare else ({},):

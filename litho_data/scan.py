@@ -5,9 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.grid import PixelGrid
-from litho_data.foundation.kinds import YX, Array
 
 Axis = Literal["x", "y"]
 

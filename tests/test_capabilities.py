@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "capabilities.toml"
 PACKAGES = ("litho_data", "litho_models", "litho_design")
 # Rooms whose `__all__` is for other rooms and on no page.
-INNER = {"litho_models.fitting"}
+INNER = {"litho_data.foundation", "litho_models.fitting"}
 # Of every command by itself, and of torchrun.
 ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python", "--plugin"}
 

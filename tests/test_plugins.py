@@ -64,8 +64,9 @@ if __name__ == "__main__":
     run("litho-models", "freeze", "run", "--out", "printer")
     run("litho-models", *bench.split())
     run("litho-models", *loop.split())
-    hoe = "hoe --model printer --size-px 32 --distance-um 20 --iterations 2 --out hologram"
-    run("litho-design", *hoe.split(), "--set", "search.polish_rounds=0")
+    few = "--size-px 32 --distance-um 20 --iterations 2 --set search.polish_rounds=0 --out"
+    run("litho-design", "hoe", "--model", "printer", *few.split(), "hologram")
+    run("litho-design", "compare", *"--models printer --seeds 2 --workers 2".split(), *few.split(), "gap")
     from litho_design.tasks.task import registered_task
     print(registered_task("colours-in-planes"))
 """
@@ -109,6 +110,7 @@ def test_what_an_installed_plugin_registers_is_used_by_every_command_and_worker(
     loop = json.loads((tmp_path / "loop" / "close_loop.json").read_text())
     assert "sinking-layers" in {one["name"] for one in (*loop["candidates"], *loop["effects"])}
     assert "two-spots" in (tmp_path / "hologram" / "design.json").read_text()
+    assert len(list((tmp_path / "gap").rglob("design.json"))) == 2
 
 
 def test_a_file_is_loaded_once_and_in_every_worker(tmp_path: Path, unknown: None) -> None:

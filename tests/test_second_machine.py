@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
-from benchmarks.record import published
-from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, made, started, text_of
+from benchmarks import film_design, film_trials
+from benchmarks.record import NOT_MEASURED, published
+from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, judged, made, started, text_of
 from litho_models.models.printers import Printer
+from tests.litho_models.prints import make_scan
 
 GEOMETRY: dict[str, Any] = {"pitch_um": 0.004, "levels": 17, "level_height_um": 0.01375}
 
@@ -37,6 +43,30 @@ def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
     assert not models[0].raw_etch__bias_px.requires_grad
 
 
-def test_the_page_shows_the_record() -> None:
-    record = json.loads(RESULT.read_text(encoding="utf-8"))
-    assert published(PAGE, "second machine") == text_of(record)
+def test_a_print_is_off_by_what_its_edges_are_displaced() -> None:
+    scan = replace(make_scan(0, 128), seen_by="sem")
+    level = np.zeros((128, 128), np.uint8)
+    level[40:90, 40:90] = scan.levels - 1
+    film = film_design.wanted_film(replace(scan, mask_level=level), 112)
+    # All four edges of a square are a pixel off, less at its rounded corners.
+    smaller = binary_erosion(film.mask_level) * film.height_um.max()
+    for printed, pixels in ((film.height_um, 0.0), (smaller, 1.0)):
+        found = judged(film, printed)
+        assert found["edge_mean_nm"] == pytest.approx(1e3 * scan.pitch_um * pixels, rel=0.03)
+        assert (found["missing"], found["extra"], found["merged"]) == (0, 0, 0)
+    assert judged(film, 0 * film.height_um)["missing"] == 1
+    layout = film_design.settings_for(scan, 64).layout
+    assert (layout.pitch_um, layout.cell_um, layout.levels) == (scan.pitch_um, scan.pitch_um, scan.levels)
+
+
+@pytest.mark.parametrize(
+    ("name", "result", "text"),
+    [
+        ("second machine", RESULT, text_of),
+        ("film design", film_design.RESULT, film_design.text_of),
+        ("film trials", film_trials.RESULT, film_trials.text_of),
+    ],
+)
+def test_the_page_shows_the_record(name: str, result: Path, text: Callable[[Any], str]) -> None:
+    made = text(json.loads(result.read_text(encoding="utf-8"))) if result.is_file() else NOT_MEASURED
+    assert published(PAGE, name) == made

@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.files import parsed
+from litho_data.foundation import InputError, parsed, um_per, unknown_name
 from litho_data.foundation.names import PlainName
-from litho_data.foundation.quantities import LENGTH_UM
+from litho_data.foundation.quantities import LENGTH_UM, Levels
 from litho_data.foundation.results import Record, first_error
-from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 
@@ -129,7 +127,7 @@ class LayoutFiles(Record):
     files: FilePatterns
     pitch_um: Length
     level_height_um: Length
-    levels: int = Field(ge=2, le=256)
+    levels: Levels
     grey_per_level: Length | None = None
     average_px: int | None = Field(default=None, ge=2, le=15)
 
@@ -145,8 +143,9 @@ class LayoutFiles(Record):
 class ScanFiles(Record):
     """The scan files. ``size_um`` is (y, x), for formats that do not carry it.
 
-    ``instrument``: the kind of microscope. The files of ``sem``, a scanning electron microscope, are pictures
-    of a film of the layout's full height; the build measures the edges of the film.
+    ``instrument``: the kind of microscope. A ``confocal`` one has no tip. The files of ``sem``, a scanning
+    electron microscope, are pictures of a film of the layout's full height; the build measures the edges of
+    the film.
 
     ``levelled``: whether the build takes the heights from the files without levelling them.
     ``missing``: numbers and words that mark pixels without a measurement; an empty list says that there are
@@ -284,6 +283,8 @@ class Card(Record):
         heights = (self.process.level, self.process.tip, self.calibration, self.grating)
         if self.scan.instrument == "sem" and any(one is not None for one in heights):
             raise ValueError("wanted no levelling, tip, calibration or grating: micrographs have none")
+        if self.scan.instrument == "confocal" and self.process.tip is not None:
+            raise ValueError("wanted no tip: a confocal microscope has none")
         return self
 
 

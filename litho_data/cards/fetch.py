@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from litho_data.cards.card import load_card
 from litho_data.commands.progress import progress
-from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation import InputError, file_sha256, unknown_name
 
 if TYPE_CHECKING:
     import pooch

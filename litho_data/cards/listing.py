@@ -8,12 +8,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
-from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table, size_of
-from litho_data.foundation.errors import InputError
+from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
+from litho_data.foundation import Facts, InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
 # Longest time that a card's expression may take to match, in a process of its own.
@@ -42,28 +42,23 @@ class PrintedField:
     layout: Path | None
     full_scale_um: float | None = None
     columns: Mapping[str, float | str] = field(default_factory=dict)
-    read: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class LeftAside:
-    """Unused files, of an id with only one file (``unpaired``) or of a refused id."""
-
-    id: str
-    files: tuple[Path, ...]
-    unpaired: bool
-    reason: str
+    read: Facts = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Listing:
-    """A card, the folder of its files, the fields to build, and unused files with reasons."""
+    """A card, the folder of its files, the fields to build, and the files of every id.
+
+    ``unpaired`` (only one file) and ``refused`` map ids that are no fields to reasons.
+    """
 
     card: Card
     card_path: Path
     data_dir: Path
     fields: tuple[PrintedField, ...]
-    left_aside: tuple[LeftAside, ...]
+    files: Mapping[str, tuple[Path, ...]]
+    unpaired: Mapping[str, str]
+    refused: Mapping[str, str]
     assumptions: tuple[str, ...]
 
     def relative(self, path: Path) -> str:
@@ -91,46 +86,43 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
 
     fields: list[PrintedField] = []
-    aside: list[LeftAside] = []
+    every: dict[str, tuple[Path, ...]] = {}
+    unpaired: dict[str, str] = {}
+    refused: dict[str, str] = {}
     ids = sorted({*layouts, *scans, *table})
     print_ids = dict(zip(ids, prints_of(ids, card.ids.print), strict=True))
     for scan_id in ids:
         row = table.get(scan_id, {})
-        use = cast(Use, row.get("use", "dataset"))
+        use: Use = row.get("use", "dataset")
         files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
-        every = tuple(one for found in files for one in found)
+        every[scan_id] = tuple(one for found in files for one in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
-            aside.append(LeftAside(scan_id, every, True, f"no file {shown}"))
+            unpaired[scan_id] = f"no file {shown}"
             continue
         print_id = print_ids[scan_id]
         scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
-        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
+        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every[scan_id], folder)
         if not reason and (several := [found for found in files if len(found) > 1]):
             names = ", ".join(one.name for one in several[0])
             reason = f"several files: {names}; the pattern has to tell them apart"
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
-            aside.append(LeftAside(scan_id, every, False, reason))
+            refused[scan_id] = reason
             continue
         fields.append(
             PrintedField(
                 id=scan_id,
                 print_id=print_id or scan_id,
-                order=int(row["order"]) if "order" in row else len(fields),
+                order=row.get("order", len(fields)),
                 use=use,
                 scan=scans[scan_id][0],
                 layout=layouts[scan_id][0] if scan_id in layouts else None,
                 full_scale_um=scale,
-                columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row}
-                | {name: row[name] for name in TEXT_COLUMNS if name in row},
-                read={
-                    name: size_of(row[name]) if name == "size_um" else row[name]
-                    for name in READ_COLUMNS
-                    if name in row
-                },
+                columns={name: row[name] for name in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) if name in row},
+                read={name: row[name] for name in READ_COLUMNS if name in row},
             )
         )
     if card.grating is None and (unknown := [one.id for one in fields if one.use == "grating"]):
@@ -140,11 +132,12 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             wanted="period_um in that table, from its certificate",
         )
     if not any(one.use == "dataset" for one in fields):
-        shown = "; ".join(f"{one.id}: {one.reason}" for one in aside[:3]) or "no ids"
+        shown = "; ".join(f"{key}: {why}" for key, why in [*{**unpaired, **refused}.items()][:3]) or "no ids"
         raise InputError(
             f"card {file}: no field to build", got=shown, wanted="a layout and a scan with the same id"
         )
-    return Listing(card, file, folder, tuple(fields), tuple(aside), _assumptions(card, table))
+    assumed = _assumptions(card, table)
+    return Listing(card, file, folder, tuple(fields), every, unpaired, refused, assumed)
 
 
 def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:
@@ -182,9 +175,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
     return {scan_id: paths for scan_id, paths in found.items() if paths}
 
 
-def _refusal(
-    scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, str]], card: Card
-) -> str:
+def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:
     """Why an id cannot be used although it has all files; empty if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may hold letters, digits, space and ._+- only"
@@ -201,7 +192,7 @@ def leads_out(files: tuple[Path, ...], folder: Path) -> str:
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
 
 
-def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
+def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
     if card.ids.table is None:
         return {}
     path = next((folder / card.ids.table for folder in folders if (folder / card.ids.table).is_file()), None)
@@ -212,7 +203,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
     return read_table(path)
 
 
-def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
     """Facts that the card does not state and that are assumed for the effects that need them."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:

@@ -4,16 +4,12 @@ import csv
 import json
 import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from litho_data.cards.card import Use
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.files import parsed
-from litho_data.foundation.kinds import YX
-from litho_data.foundation.quantities import ORDER
-from litho_data.foundation.units import is_length
+from litho_data.foundation import InputError, about, is_length, parsed, require_known
+from litho_data.foundation.quantities import LENGTH_UM, ORDER
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import read_text
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
@@ -23,11 +19,12 @@ READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
 """What the table may say about single scans; it replaces the card's ``[scan]``."""
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
 _NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")
+_TOO_MANY = "(too many cells)"
 _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
-def read_table(path: Path) -> dict[str, dict[str, str]]:
-    """Rows of a card's CSV table by id, without empty cells; all other cells have been checked.
+def read_table(path: Path) -> dict[str, dict[str, Any]]:
+    """Rows of a card's CSV table by id: the checked value of every cell that is not empty.
 
     It reads what spreadsheets write in any language: cells separated by commas, semicolons or tabs, text that
     may be UTF-16, and decimal commas where commas do not separate cells.
@@ -39,7 +36,7 @@ def read_table(path: Path) -> dict[str, dict[str, str]]:
     try:
         lines = read_text(path).splitlines()
         separator = max(",;\t", key=(lines or [""])[0].count)
-        reader = csv.DictReader(lines, strict=True, restkey="(too many cells)", delimiter=separator)
+        reader = csv.DictReader(lines, strict=True, restkey=_TOO_MANY, delimiter=separator)
         rows = list(reader)
         columns = list(reader.fieldnames or ())
     except (OSError, InputError, csv.Error) as error:
@@ -47,63 +44,59 @@ def read_table(path: Path) -> dict[str, dict[str, str]]:
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown or "id" not in columns:
         raise InputError(f"columns of {path}", got=columns, wanted=f"id and any of {', '.join(COLUMNS[1:])}")
-    table: dict[str, dict[str, str]] = {}
+    needed = [name for name in ("id", "order") if name in columns]
+    table: dict[str, dict[str, Any]] = {}
     for number, row in enumerate(rows, start=2):
-        filled = {
-            key: value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()
-        }
-        if separator != ",":
-            filled |= {key: filled[key].replace(",", ".") for key in _NUMBERS if key in filled}
-        _check_row(filled, f"{path} line {number}", "(too many cells)" in row, "order" in columns)
-        if filled["id"] in table:
-            raise InputError(f"{path} line {number}: id", got=repr(filled["id"]), wanted="each id once")
+        with about(f"{path} line {number}"):
+            if _TOO_MANY in row:
+                raise InputError("cells", got="more cells than columns")
+            cells = {key: (value or "").strip() for key, value in row.items()}
+            if separator != ",":
+                cells |= {key: cells[key].replace(",", ".") for key in _NUMBERS if key in cells}
+            filled = {key: _value(key, text) for key, text in cells.items() if text or key in needed}
+            if filled["id"] in table:
+                raise InputError("id", got=repr(filled["id"]), wanted="each id once")
         table[filled.pop("id")] = filled
     return table
 
 
-def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: bool) -> None:
-    if overfull:
-        raise InputError(f"{what}: cells", got="more cells than columns")
-    scan_id = row.get("id", "")
-    if not SAFE_ID.fullmatch(scan_id):
-        raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id without a path")
-    order = row.get("order", "")
-    if needs_order and not (order.lstrip("-").isdecimal() and ORDER.holds(order)):
-        raise InputError(f"{what}: order", got=repr(row.get("order", "")), wanted="a whole number")
-    require_known(f"{what}: use", row.get("use", "dataset"), get_args(Use))
-    for name in OPTIONAL_COLUMNS:
-        if name in row:
-            OPTIONAL_COLUMNS[name].require(f"{what}: {name}", row[name])
-        if name in row and float(row[name]) not in _ALLOWED.get(name, (float(row[name]),)):
-            wanted = " | ".join(f"{value:g}" for value in _ALLOWED[name])
-            raise InputError(f"{what}: {name}", got=repr(row[name]), wanted=wanted)
-    if "unit" in row and not is_length(row["unit"]):
-        raise InputError(f"{what}: unit", got=repr(row["unit"]), wanted="a length, such as nm")
-    if "size_um" in row and not size_of(row["size_um"]):
-        raise InputError(
-            f"{what}: size_um", got=repr(row["size_um"]), wanted="one side in µm, or y x x: 54 x 27"
-        )
-    for name, known in (
-        ("format", ("auto", *formats())),
-        ("fast_axis", ("x", "y")),
-        ("surround", get_args(Surround)),
-    ):
-        require_known(f"{what}: {name}", row.get(name, known[0]), known)
+def _value(name: str, text: str) -> Any:
+    """The value of a cell of this column.
 
-
-def size_of(text: str) -> YX | None:
-    """(y, x) from a cell with one side, or both sides separated by ``x``; None if it has neither."""
-    sides = [one.strip() for one in re.split("[x×]", text)]
-    if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):
-        return None
-    return float(sides[0]), float(sides[-1])
-
-
-def _is_finite(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+    Raises:
+        InputError: a text of the wrong kind.
+    """
+    words = {
+        "use": get_args(Use),
+        "format": ("auto", *formats()),
+        "fast_axis": ("x", "y"),
+        "surround": get_args(Surround),
+    }
+    value: Any = text
+    wanted = ""
+    if name in words:
+        require_known(name, text, words[name])
+    elif name in OPTIONAL_COLUMNS:
+        OPTIONAL_COLUMNS[name].require(name, text)
+        value, allowed = float(text), _ALLOWED.get(name)
+        wanted = " | ".join(f"{one:g}" for one in allowed) if allowed and value not in allowed else ""
+    elif name == "id" and not SAFE_ID.fullmatch(text):
+        wanted = "an id without a path"
+    elif name == "order":
+        whole = text.lstrip("-").isdecimal() and ORDER.holds(text)
+        value, wanted = (int(text), "") if whole else (None, "a whole number")
+    elif name == "unit" and not is_length(text):
+        wanted = "a length, such as nm"
+    elif name == "size_um":
+        sides = [one.strip() for one in re.split("[x×]", text)]
+        sides = sides * 2 if len(sides) == 1 else sides
+        if len(sides) == 2 and all(LENGTH_UM.holds(one) for one in sides):
+            value = float(sides[0]), float(sides[1])
+        else:
+            wanted = "one side in µm, or y x x: 54 x 27"
+    if wanted:
+        raise InputError(name, got=repr(text), wanted=wanted)
+    return value
 
 
 def read_full_scales(path: Path) -> dict[str, float]:

@@ -100,10 +100,10 @@ def build(
     typer.echo(
         f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {unpaired}{result.seconds:.1f} s"
     )
-    if result.unpaired:
-        typer.echo(f"{result.unpaired[0].id}: {result.unpaired[0].reason}", err=True)
-    if skipped := [one.id for one in result.skipped]:
-        typer.echo(f"skipped: {', '.join(skipped)}; --strict refuses to build without them", err=True)
+    for key, reason in [*result.unpaired.items()][:1]:
+        typer.echo(f"{key}: {reason}", err=True)
+    if result.skipped:
+        typer.echo(f"skipped: {', '.join(result.skipped)}; --strict refuses to build without them", err=True)
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
 

@@ -33,7 +33,7 @@ def masks(
     pattern: Annotated[str, option("random, or a calibration pattern: see --list-patterns")] = "random",
     count: Annotated[int, option("number of random layouts", min=1)] = 12,
     size_px: Annotated[int, option("side of a layout", min=8)] = 512,
-    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=256)] = 13,
+    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=65536)] = 13,
     cutoff_per_um: Annotated[float, option("low-pass cut-off, cycles/µm")] = 0.25,
     passband: Annotated[str, option("square (as the measured layouts) or round")] = "square",
     quantiser: Annotated[
@@ -110,7 +110,6 @@ def simulate(
     references: Annotated[
         bool, option("add scans of a bare substrate, a flat and a 5-step print", "--references")
     ] = False,
-    metadata: Annotated[str, option("full, or files-only (no order, positions, write axis)")] = "full",
     list_knobs: Annotated[
         bool,
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
@@ -120,7 +119,7 @@ def simulate(
 
     Example: litho-data simulate --preset demo --knob laser-drift=0.05 --out fab
     """
-    from litho_data.foundation.errors import InputError
+    from litho_data.foundation import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate, simulate_plan
     from litho_data.virtual_fab.films import (
         FILM_PRINTERS,
@@ -165,7 +164,6 @@ def simulate(
         seed=seed,
         write_field_um=write_field_um,
         references=references,
-        metadata=metadata,
         jobs=jobs_of_card(layouts, printer=printer) if layouts is not None else None,
     )
     typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from litho_data.commands.app import argument, keyword, option, takes_more
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX
+from litho_data.foundation import YX, Facts, InputError
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import NUMBER, number
 
@@ -59,7 +58,7 @@ def level(
     scan: ScanPath,
     recipe: Annotated[Path, option("levelling recipe (TOML)")],
     out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
-    how: Mapping[str, Any],
+    how: Facts,
 ) -> None:
     """Level one scan; writes the levelled heights, the removed surface and a record beside them.
 
@@ -82,7 +81,7 @@ def level(
 @reads_scans
 def inspect(
     file: ScanPath,
-    how: Mapping[str, Any],
+    how: Facts,
     picture: Annotated[Path | None, option("PNG to write")] = None,
     header: Annotated[bool, option("print the full header of the file", "--header")] = False,
 ) -> None:

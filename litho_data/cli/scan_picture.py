@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import atomic_file
 from litho_data.reports.pictures import limits, new_figure
 from litho_data.scan import Scan
 

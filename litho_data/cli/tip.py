@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from litho_data.cli.scan import reads_scans
 from litho_data.commands.app import argument, option
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Facts, InputError
 
 if TYPE_CHECKING:
     from litho_data.tip import TipEstimate
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 @reads_scans
 def tip(
     scans: Annotated[list[Path], argument("one scan, or all scans of one tip, of the same pitch")],
-    how: Mapping[str, Any],
+    how: Facts,
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from litho_data.commands.progress import command_line, given_words, never_silent
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import InputError, unknown_name
 from litho_data.foundation.plugins import OPTION, load_plugins, without_plugins
 from litho_data.foundation.run_facts import running_command
 

@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.files import parsed
+from litho_data.foundation import Facts, InputError, parsed, unknown_name
 from litho_data.foundation.quantities import LENGTH_UM
 
 M = TypeVar("M", bound=BaseModel)
@@ -89,7 +88,7 @@ def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> 
     )
 
 
-def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "setting") -> dict[str, Any]:
+def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dict[str, Any]:
     """Values by dotted path, from nested or dotted keys.
 
     Args:
@@ -134,7 +133,7 @@ def _names(part: BaseModel, above: str) -> list[str]:
     return [f"{above}.{name}" if above else name for name in type(part).model_fields]
 
 
-def changed(settings: M, changes: Mapping[str, Any]) -> M:
+def changed(settings: M, changes: Facts) -> M:
     """``settings`` with values by dotted path, checked as a whole.
 
     Raises:

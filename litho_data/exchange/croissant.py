@@ -1,18 +1,20 @@
 """The Croissant description of a release: its files, and the columns of its quality table."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from litho_data.foundation import Facts
 
 _VERSION = "http://mlcommons.org/croissant/1.0"
 _CONTEXT = json.loads(Path(__file__).with_name("croissant.json").read_text(encoding="utf-8"))
 _TYPES = {"i": "sc:Integer", "f": "sc:Float", "b": "sc:Boolean"}
 
 
-def croissant(root: Mapping[str, Any], files: Sequence[Mapping[str, Any]], table: Path) -> dict[str, Any]:
+def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any]:
     """The description as JSON-LD.
 
     Args:
@@ -51,7 +53,7 @@ def croissant(root: Mapping[str, Any], files: Sequence[Mapping[str, Any]], table
     }
 
 
-def _file_object(file: Mapping[str, Any]) -> dict[str, Any]:
+def _file_object(file: Facts) -> dict[str, Any]:
     return {
         "@type": "cr:FileObject",
         "@id": file["@id"],

@@ -17,10 +17,8 @@ from litho_data.cards.card import Card, check_card
 from litho_data.cards.listing import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales
 from litho_data.commands.progress import progress
+from litho_data.foundation import Array, InputError, file_sha256, record_sha256
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.foundation.kinds import Array
 from litho_data.making.assemble import Source
 from litho_data.making.build import make_store
 from litho_data.making.chain import Chain

@@ -7,10 +7,8 @@ from typing import Any
 
 from litho_data.commands.progress import progress
 from litho_data.exchange.croissant import croissant
+from litho_data.foundation import InputError, atomic_file, file_sha256
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
-from litho_data.foundation.hashes import file_sha256
 from litho_data.store.read import Store, open_store
 
 # Zip needs a time for every file; with a fixed one, the same store gives the same archive.

@@ -14,13 +14,13 @@ The law: a command that was stopped after any of its writes and is run again end
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from litho_data.foundation.files import atomic_folder, clear_leftovers, locked, writable
+from litho_data.foundation.kinds import Facts
 from litho_data.foundation.outputs import (
     read_record,
     require_own_folder,
@@ -41,7 +41,7 @@ class Begun:
 
 @contextmanager
 def growing_folder(
-    out: str | Path, record: str, facts: Mapping[str, Any] | None = None, *, holds: str = ""
+    out: str | Path, record: str, facts: Facts | None = None, *, holds: str = ""
 ) -> Iterator[Begun]:
     """A folder whose files appear as they are finished, so that a stopped run can resume.
 
@@ -84,7 +84,7 @@ def growing_folder(
 
 @contextmanager
 def whole_folder(
-    out: str | Path, *holds: str, record: str = "", facts: Mapping[str, Any] | None = None
+    out: str | Path, *holds: str, record: str = "", facts: Facts | None = None
 ) -> Iterator[Path]:
     """A folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
 
@@ -103,7 +103,7 @@ def whole_folder(
         yield folder
 
 
-def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str) -> bool:
+def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
     """Whether the same result is begun there already."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record

@@ -6,6 +6,7 @@ import glob
 import os
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -183,6 +184,11 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
         return parse(read_text(file))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(what, got=error, wanted=wanted) from error
+
+
+def table_beside(module: str, name: str) -> dict[str, Any]:
+    """The table of data that stands beside a module, as TOML."""
+    return tomllib.loads(Path(module).with_name(name).read_text(encoding="utf-8"))
 
 
 @contextmanager

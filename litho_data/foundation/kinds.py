@@ -1,4 +1,7 @@
-"""Types that nearly every signature uses: maps, their shapes, and pairs of lengths along y and x."""
+"""Types that nearly every signature uses: maps, their shapes, pairs of lengths along y and x, plain data."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -7,3 +10,5 @@ Shape = tuple[int, ...]
 """(ny, nx), pixels."""
 YX = tuple[float, float]
 """Along y and along x: a pitch, a size, a place."""
+Facts = Mapping[str, Any]
+"""Plain data by name: parameters, attributes, a record."""

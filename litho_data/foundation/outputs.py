@@ -6,13 +6,13 @@ else is refused, and nothing is changed.
 """
 
 import json
-from collections.abc import Mapping
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import read_text
+from litho_data.foundation.kinds import Facts
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
@@ -42,7 +42,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         )
 
 
-def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
+def require_same(folder: Path, held: Any, facts: Facts) -> None:
     """Refuse a folder whose record, finished or begun, holds other facts than these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
@@ -54,7 +54,7 @@ def require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
         )
 
 
-def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
+def first_difference(then: Facts, now: Facts, path: str = "") -> str:
     """The first setting of ``now`` that ``then`` lacks or has with another value, in words; "" if none."""
     for name, after in now.items():
         if isinstance(after, dict):

@@ -49,7 +49,7 @@ LENGTH_UM = Range(1e-6, 1e7, "µm")
 PLACE_UM = Range(-1e7, 1e7, "µm")
 DOSE = Range(1e-3, 1e3)
 ORDER = Range(-1e9, 1e9)
-LEVELS = Range(2, 256)
+LEVELS = Range(2, 65536)
 
 PitchUm = Annotated[float, Field(ge=PITCH_UM.low, le=PITCH_UM.high)]
 LevelHeightUm = Annotated[float, Field(ge=LEVEL_HEIGHT_UM.low, le=LEVEL_HEIGHT_UM.high)]

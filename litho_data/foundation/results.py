@@ -32,10 +32,9 @@ class Record(BaseModel):
 
 
 class Result(Record):
-    """The root of a result file. Subclasses set ``SCHEMA``, ``FILE_NAME``, and ``OLDER`` schemas to read."""
+    """The root of a result file. Subclasses set ``SCHEMA`` and ``FILE_NAME``."""
 
     SCHEMA: ClassVar[str]
-    OLDER: ClassVar[tuple[str, ...]] = ()
     FILE_NAME: ClassVar[str]
 
     schema_: str = Field(default="", alias="schema")
@@ -44,7 +43,7 @@ class Result(Record):
     @classmethod
     def _of_this_schema(cls, content: Any) -> Any:
         content = {"schema": cls.SCHEMA} | content if isinstance(content, dict) else content
-        if isinstance(content, dict) and content["schema"] not in (cls.SCHEMA, *cls.OLDER):
+        if isinstance(content, dict) and content["schema"] != cls.SCHEMA:
             raise ValueError(f"schema {content['schema']!r} is not {cls.SCHEMA!r}")
         return content
 
@@ -95,7 +94,7 @@ class Result(Record):
         parse = partial(json.loads, parse_constant=_refuse)
         content = parsed(file, parse, f"cannot read {file}", f"a result {kind}")
         schema = content.get("schema") if isinstance(content, dict) else None
-        if schema not in (cls.SCHEMA, *cls.OLDER):
+        if schema != cls.SCHEMA:
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))
         try:
             return cls.model_validate(content)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.cards.card import check_card
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, Facts
 
 CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"
@@ -24,7 +24,7 @@ def write_card(
     scan_size_um: YX,
     scan_format: str = "text-matrix",
     levelled: bool = False,
-    **tables: Mapping[str, Any],
+    **tables: Facts,
 ) -> Path:
     """Write the card of layouts in ``layouts`` and of their scans, which are or will be in ``scans``.
 
@@ -66,17 +66,17 @@ def write_card(
     return path
 
 
-def _stated(table: Mapping[str, Any]) -> dict[str, Any]:
+def _stated(table: Facts) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
-def _toml(table: Mapping[str, Any]) -> str:
+def _toml(table: Facts) -> str:
     # Strings, numbers, booleans and lists of them look the same in JSON and in TOML.
     return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in table.items())
 
 
 def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
-    """Write one layout as an 8-bit TIFF of level numbers."""
+    """Write one layout as a TIFF of level numbers."""
     import tifffile
 
     path = folder / "layouts" / f"{scan_id}.tif"

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.commands.progress import progress
+from litho_data.foundation import Array, Shape, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation.quantities import LEVELS
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
@@ -97,8 +97,7 @@ def write_layout_set(
             folder that holds a set with other settings or something else, such as scans.
     """
     require_known("pattern", pattern, PATTERNS)
-    if not 2 <= levels <= 256:
-        raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    LEVELS.require("levels of a layout", levels)
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px
     settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed, quantiser, field_px)
     made = {"pattern": pattern, **asdict(settings), "level_height_um": level_height_um}

@@ -1,19 +1,18 @@
 """Calibration patterns: prints that measure one thing at a time.
 
-All functions return uint8 levels of shape (ny, nx); lengths are rounded to whole pixels.
+All functions return levels (ny, nx) in the smallest unsigned type; lengths are rounded to whole pixels.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
 
 
 def flat(shape: Shape, *, level: int) -> Array:
     """One level everywhere: roughness, vignetting, flatness."""
-    return np.full(shape, level, np.uint8)
+    return np.full(shape, level, np.min_scalar_type(level))
 
 
 def step_ladder(shape: Shape, *, highest: int) -> Array:
@@ -46,8 +45,8 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
             got=f"{frame.shape[1]} px and {highest - lowest + 1} levels",
             wanted=f"at least {5 * tread_px} px and 3 levels: three steps of {tread_px} px",
         )
-    levels = np.rint(np.linspace(lowest, highest, steps)).astype(np.uint8)
-    layout = frame.astype(np.uint8)
+    levels = np.rint(np.linspace(lowest, highest, steps))
+    layout = frame.astype(np.min_scalar_type(highest))
     layout[inset_y:-inset_y, inset_x:-inset_x] = levels[np.arange(width) * steps // width]
     return layout
 
@@ -56,7 +55,7 @@ def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Arra
     """Squares of ``cell_px``, the top left one high: lateral scale, shear, corners."""
     _positive(cell_px, "cell_px of a checkerboard")
     y, x = np.indices(shape) // cell_px
-    return np.where((y + x) % 2 == 0, high, low).astype(np.uint8)
+    return np.where((y + x) % 2 == 0, high, low).astype(np.min_scalar_type(high))
 
 
 def line_space_sweep(
@@ -86,7 +85,7 @@ def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
     # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
-    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.uint8)
+    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.min_scalar_type(high))
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
@@ -103,7 +102,7 @@ def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, g
             got=list(widths_px),
             wanted=f"1 to {min(cell) // 3} px in a {shape[0]} x {shape[1]} px layout",
         )
-    layout = np.full(shape, ground, np.uint8)
+    layout = np.full(shape, ground, np.min_scalar_type(max(feature, ground)))
     for index, width in enumerate(widths_px):
         row, column = divmod(index, side)
         top = row * cell[0] + (cell[0] - width) // 2
@@ -120,7 +119,7 @@ def relative_doses(count: int) -> Array:
 
 
 def _rows(profile: Array, shape: Shape) -> Array:
-    return np.broadcast_to(profile.astype(np.uint8), shape).copy()
+    return np.broadcast_to(profile.astype(np.min_scalar_type(profile.max())), shape).copy()
 
 
 def _positive(value: int, what: str) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
+from litho_data.foundation.quantities import LEVELS
 
 PASSBANDS = ("square", "round")
 QUANTISERS = ("round", "floor")
@@ -41,14 +41,13 @@ def random_layout(
             and it may lack the lowest or the highest level. None: the layout is the field.
 
     Returns:
-        uint8, shape (ny, nx).
+        uint8 (beyond 256 levels uint16), shape (ny, nx).
 
     Raises:
-        InputError: fewer than 2 or more than 256 levels, a cut-off that leaves nothing to vary, or a field
+        InputError: fewer than 2 or more than 65536 levels, a cut-off that leaves nothing to vary, or a field
             smaller than the layout.
     """
-    if not 2 <= levels <= 256:
-        raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    LEVELS.require("levels of a layout", levels)
     whole = shape if field_px is None else (field_px, field_px)
     if field_px is not None and field_px < max(shape):
         raise InputError("field_px of a random layout", got=field_px, wanted=f"at least {max(shape)}")
@@ -95,6 +94,7 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below; uint8."""
+    """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below."""
     require_known("quantiser", quantiser, QUANTISERS)
-    return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)
+    whole = np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round"))
+    return whole.astype(np.min_scalar_type(levels - 1))

@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Result
 
 _FEWEST_PX = 64
@@ -44,7 +43,7 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
     """Collect the statistics of layouts, one at a time.
 
     Args:
-        layouts: uint8 levels (ny, nx), or paths of layout files.
+        layouts: levels (ny, nx), or paths of layout files.
         levels: number of levels L.
         pitch_um: pixel pitch, µm.
 

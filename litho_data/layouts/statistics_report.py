@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.layouts.statistics import LayoutStatistics
 from litho_data.reports.page import Page
 from litho_data.reports.pictures import new_figure

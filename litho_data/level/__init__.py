@@ -6,14 +6,13 @@ from litho_data.level.plane import (
     fix_zero,
     level_facet,
     level_plane,
-    level_three_point,
     zero_max,
     zero_mean,
 )
 from litho_data.level.polynomial import level_polynomial, level_robust
 from litho_data.level.recipe import Recipe
 from litho_data.level.rows import LevellingWarning, align_rows
-from litho_data.level.scars import mark_scars, remove_scars
+from litho_data.level.scars import mark_scars
 from litho_data.level.selection import Levelled, MaskedLevelling, Masking
 
 __all__ = [
@@ -30,11 +29,9 @@ __all__ = [
     "level_plane",
     "level_polynomial",
     "level_robust",
-    "level_three_point",
     "mark_features",
     "mark_scars",
     "mask_and_relevel",
-    "remove_scars",
     "zero_max",
     "zero_mean",
 ]

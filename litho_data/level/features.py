@@ -6,8 +6,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import (
     Degree,

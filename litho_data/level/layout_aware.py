@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field
 from scipy import ndimage
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, InputError, Shape
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, subtract

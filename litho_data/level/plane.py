@@ -1,13 +1,10 @@
-"""Remove tilt and set zero as in Gwyddion: planes by fit, points or prevailing facet."""
+"""Remove tilt and set zero as in Gwyddion: planes by fit or prevailing facet."""
 
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.level.operation import operation
 from litho_data.level.polynomial import fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, subtract
@@ -29,48 +26,6 @@ def level_plane(z: Array, chosen: Array) -> Levelled:
     # Fitted over coordinates from -1 to 1.
     ny, nx = z.shape
     return _without_tilt(z, 2 * coefficients[0, 1] / (nx - 1), 2 * coefficients[1, 0] / (ny - 1))
-
-
-@operation("three-point")
-def level_three_point(
-    z: Array,
-    chosen: Array,
-    *,
-    points_px: tuple[YX, YX, YX],
-    radius_px: Annotated[float, Field(ge=0)] = 0.0,
-    set_zero: bool = False,
-) -> Levelled:
-    """Subtract the plane through three points, each the mean over a disc.
-
-    Args:
-        points_px: three (y, x) positions in pixel indices.
-        radius_px: radius of the disc; 0 takes the one pixel.
-        set_zero: put the three points to zero; otherwise the height at the pivot (nx/2, ny/2)
-            stays, as in ``level_plane``.
-
-    Raises:
-        InputError: not three points, a disc without a selected pixel, or points on one line.
-    """
-    heights = [_disc_mean(z, chosen, point, radius_px) for point in points_px]
-    design = np.array([[1.0, x, y] for y, x in points_px])
-    if abs(np.linalg.det(design)) < 1e-9 * z.size:
-        raise InputError(
-            "three-point levelling", got=f"points {list(points_px)}", wanted="points not on one line"
-        )
-    constant, slope_x, slope_y = np.linalg.solve(design, heights)
-    at_pivot = constant + slope_x * z.shape[1] / 2 + slope_y * z.shape[0] / 2
-    return _without_tilt(z, slope_x, slope_y, at_pivot if set_zero else 0.0)
-
-
-def _disc_mean(z: Array, chosen: Array, point: YX, radius: float) -> float:
-    if not (0 <= point[0] <= z.shape[0] - 1 and 0 <= point[1] <= z.shape[1] - 1):
-        raise InputError("three-point levelling: point (y, x)", got=point, wanted=f"a pixel of {z.shape}")
-    y, x = (np.arange(n) - centre for n, centre in zip(z.shape, point, strict=True))
-    distance2 = np.add.outer(y**2, x**2)
-    disc = chosen & (distance2 <= max(radius**2, distance2.min()))
-    if not disc.any():
-        raise InputError("three-point levelling", got=f"no selected pixel within {radius} px of {point}")
-    return float(z[disc].mean())
 
 
 @operation("facet")
@@ -120,10 +75,10 @@ def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: 
     return total
 
 
-def _without_tilt(z: Array, slope_x: float, slope_y: float, at_pivot: float = 0.0) -> Levelled:
-    """The map minus the plane with these slopes per pixel and this height at column nx/2, row ny/2."""
+def _without_tilt(z: Array, slope_x: float, slope_y: float) -> Levelled:
+    """The map minus the plane with these slopes per pixel that is zero at column nx/2, row ny/2."""
     y, x = (np.arange(n) - n / 2 for n in z.shape)
-    return subtract(z, np.add.outer(slope_y * y + at_pivot, slope_x * x))
+    return subtract(z, np.add.outer(slope_y * y, slope_x * x))
 
 
 @operation("fix-zero")

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from pydantic import Field
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.level.operation import operation
 from litho_data.level.selection import Levelled, subtract
 

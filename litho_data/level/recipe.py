@@ -14,9 +14,7 @@ import litho_data.level.layout_aware
 import litho_data.level.plane
 import litho_data.level.polynomial
 import litho_data.level.scars  # noqa: F401
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.files import parsed
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError, about, parsed
 from litho_data.foundation.results import first_error
 from litho_data.level.operation import STEPS, State, Step
 from litho_data.level.rows import LevellingWarning

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6

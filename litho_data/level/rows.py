@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.level.operation import operation
 from litho_data.level.plane import prevailing_slope
 from litho_data.level.row_statistics import METRE_PER_UM, row_modus, row_trimmed_mean

@@ -6,10 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
-from litho_data.foundation.hashes import array_sha256, file_sha256
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError, array_sha256, atomic_file, file_sha256
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.level import Recipe

@@ -4,8 +4,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 
 Masking = Literal["ignore", "exclude", "include"]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from litho_data.cards.card import Card
-from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, array_sha256, file_sha256, record_sha256
+from litho_data.foundation.hashes import canonical_json
 from litho_data.making.jobs import Job
 from litho_data.making.operations import READERS, no_recipe
 from litho_data.store.partial import outputs_of
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import zarr
 
-Record = Mapping[str, Any]
 # The group that lists the scans for tools of OME-Zarr.
 IMAGES = "o"
 
@@ -38,7 +37,7 @@ class Source:
     jobs: Sequence[Job]
     data_dir: Path
     files: Mapping[str, Mapping[str, Path]]
-    recipe: Mapping[str, Any] = field(default_factory=no_recipe)
+    recipe: Facts = field(default_factory=no_recipe)
     seed: int = 0
     standards: Mapping[str, Path] = field(default_factory=dict)
     assumptions: Sequence[str] = ()
@@ -48,11 +47,11 @@ class Source:
 
 def assemble(
     root: zarr.Group,
-    records: Sequence[Record],
+    records: Sequence[Facts],
     load: Callable[[str], Mapping[str, Array]],
     source: Source,
     skipped: Mapping[str, str],
-    build: Record,
+    build: Facts,
 ) -> str:
     """Write everything except the groups ``scans/<id>``, which exist; returns the dataset's hash.
 
@@ -84,7 +83,7 @@ def assemble(
     return sha256
 
 
-def records_of_use(records: Sequence[Record]) -> list[Record]:
+def records_of_use(records: Sequence[Facts]) -> list[Facts]:
     """The records of the dataset's own scans, references left out, in order."""
     return [record for record in records if record["use"] == "dataset"]
 
@@ -95,7 +94,7 @@ def facts_of_card(card: Card) -> dict[str, Any]:
     return dataset_facts(card.layout, card.scan.instrument, write)
 
 
-def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
+def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
     """The attributes of the root group; all but the two hashes follow from the manifest.
 
     They are numbers and words only, which any format can hold.
@@ -136,7 +135,7 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
     return json.loads(json.dumps(content))
 
 
-def quality_table(records: Sequence[Record]) -> pd.DataFrame:
+def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
     """One row per scan of the dataset; a figure that could not be computed is NaN."""
     import pandas as pd
 
@@ -151,7 +150,7 @@ def quality_table(records: Sequence[Record]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
+def provenance_table(records: Sequence[Facts]) -> pd.DataFrame:
     """One row per step of every scan: the record as JSON, its id, and the software that ran it."""
     import pandas as pd
 
@@ -181,25 +180,25 @@ def table_sha256(table: pd.DataFrame) -> str:
     return record_sha256(columns)
 
 
-def _row(record: Record) -> dict[str, Any]:
+def _row(record: Facts) -> dict[str, Any]:
     keys = ("id", "print", "order", "columns")
     made = [output["name"] for output in outputs_of(record)]
     return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level"), "arrays": made}
 
 
-def _identity(record: Record) -> dict[str, Any]:
+def _identity(record: Facts) -> dict[str, Any]:
     hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
     names = [*(variable.name for variable in SAMPLE_VARIABLES), "bend_um"]
     arrays = {name: hashes[name] for name in names if name in hashes}
     return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
 
 
-def _shape_of(record: Record, *names: str) -> tuple[int, int]:
+def _shape_of(record: Facts, *names: str) -> tuple[int, int]:
     shape = next(output["shape"] for output in outputs_of(record) if output["name"] in names)
     return int(shape[0]), int(shape[1])
 
 
-def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[str, str]) -> pd.DataFrame:
+def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[str, str]) -> pd.DataFrame:
     """One row per raw file, sorted by id.
 
     Args:
@@ -241,12 +240,12 @@ def _file_identity(path: Path) -> tuple[str, int]:
         return "", 0
 
 
-def _used_sha256(record: Mapping[str, Any], name: str) -> str:
+def _used_sha256(record: Facts, name: str) -> str:
     hashes = {one["name"]: one["sha256"] for step in record["steps"] for one in step["inputs"]}
     return hashes.get(name, "")
 
 
-def _facts(record: Mapping[str, Any] | None, name: str) -> dict[str, Any]:
+def _facts(record: Facts | None, name: str) -> dict[str, Any]:
     """Facts about a scan file from its reader; none for a layout."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:

@@ -14,15 +14,15 @@ from typing import Any
 from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.commands.progress import progress, say
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.run_facts import software_record
 from litho_data.making.assemble import Source, assemble, records_of_use
 from litho_data.making.calibration import measure_scales, standards_of
 from litho_data.making.day_tip import with_tip_found
-from litho_data.making.jobs import FieldJob, Job, Skipped, field_jobs, finish
+from litho_data.making.jobs import FieldJob, Job, field_jobs, finish
 from litho_data.making.operations import UNREGISTERED, load_recipe, no_recipe
 from litho_data.making.report import write_report
-from litho_data.making.result import BuildResult, LeftOut, report_folder
+from litho_data.making.result import BuildResult, report_folder
 from litho_data.making.right_layout import doubts, fitting_layout, prints_of
 from litho_data.making.verdict import Weight, findings, odd_heights, require_heights
 from litho_data.sharing.workers import HERE, Workers, run_jobs
@@ -84,24 +84,22 @@ def _recipe(listing: Listing) -> dict[str, Any]:
     return load_recipe(None if level is None else listing.card_path.parent / level)
 
 
-def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
+def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> Source:
     standards = standards_of(listing)
     if standards.described:
         # A bad standard spoils every scan, so it is reported once, before any scan is made.
         measure_scales(standards.described, list(standards.files.values()))
-    found = {one.id: [one.layout, one.scan] for one in listing.fields}
-    found |= {one.id: [*one.files] for one in listing.left_aside}
     return Source(
         card=listing.card,
         jobs=jobs,
         data_dir=listing.data_dir,
         standards=standards.files,
-        files={key: {listing.relative(path): path for path in paths if path} for key, paths in found.items()},
+        files={key: {listing.relative(one): one for one in paths} for key, paths in listing.files.items()},
         recipe=recipe,
         seed=seed,
         assumptions=listing.assumptions,
-        unpaired={one.id: one.reason for one in listing.left_aside if one.unpaired},
-        refused={one.id: one.reason for one in listing.left_aside if not one.unpaired},
+        unpaired=listing.unpaired,
+        refused=listing.refused,
     )
 
 
@@ -122,10 +120,10 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             finished = run_jobs(making, todo, workers, name=lambda job: job.id)
             what = f"building {source.card.name}"
             for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
-                if isinstance(outcome, Skipped):
+                if isinstance(outcome, str):
                     # Names as recorded, because the manifest must not depend on where the raw files lie.
-                    skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
-                    _report_skipped(outcome.id, skipped[outcome.id])
+                    skipped[job.id] = outcome.replace(f"{source.data_dir}{os.sep}", "")
+                    _report_skipped(job.id, skipped[job.id])
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
@@ -170,8 +168,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             n_scans=len(of_use),
             n_references=len(kept) - len(of_use),
             findings=found,
-            skipped=_left_out(skipped),
-            unpaired=_left_out(source.unpaired),
+            skipped=dict(sorted(skipped.items())),
+            unpaired=dict(sorted(source.unpaired.items())),
             reused=reused,
             seconds=round(time.perf_counter() - clock, 2),
             workers=workers.processes,
@@ -213,7 +211,7 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     return named
 
 
-def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
+def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
     """Scans whose pixels have another aspect than most, if the size comes from the card, not from the file.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
@@ -246,7 +244,7 @@ def _report_skipped(scan_id: str, reason: str) -> None:
 
 
 def _require_enough(
-    records: Mapping[str, Mapping[str, Any]], left_out: Mapping[str, str], strict: bool, out: Path
+    records: Mapping[str, Facts], left_out: Mapping[str, str], strict: bool, out: Path
 ) -> None:
     shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
     if strict and left_out:
@@ -255,7 +253,3 @@ def _require_enough(
         )
     if not records_of_use(list(records.values())):
         raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")
-
-
-def _left_out(reasons: Mapping[str, str]) -> list[LeftOut]:
-    return [LeftOut(id=scan_id, reason=reason) for scan_id, reason in sorted(reasons.items())]

@@ -11,8 +11,7 @@ import numpy as np
 
 from litho_data.cards.card import Grating
 from litho_data.cards.listing import Listing, leads_out, list_fields
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, InputError, about
 from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
@@ -47,7 +46,7 @@ class Standards:
         files: the files by recorded name.
     """
 
-    described: tuple[Mapping[str, Any], ...] = ()
+    described: tuple[Facts, ...] = ()
     files: Mapping[str, Path] = field(default_factory=dict)
 
     @property
@@ -97,7 +96,7 @@ def standards_of(listing: Listing) -> Standards:
     return Standards(tuple(standards), files)
 
 
-def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> Array:
+def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
     """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 without a standard.
 
     Raises:
@@ -130,7 +129,7 @@ def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -
     return np.round(found, 10)
 
 
-def _z_scale(one: Mapping[str, Any], scan: Any, name: str) -> tuple[float, float]:
+def _z_scale(one: Facts, scan: Any, name: str) -> tuple[float, float]:
     pitch_y_um, pitch_x_um = scan.require_pitch()
     pitch_um = pitch_x_um if one["across"] == "x" else pitch_y_um
     with about(f"calibration scan {name}"):

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts
 from litho_data.foundation.run_facts import software_record
 from litho_data.making.operations import OPERATIONS, READERS
-from litho_data.making.step import Facts, Step
+from litho_data.making.step import Step
 from litho_data.store.partial import Piece
 
 
@@ -21,7 +21,7 @@ class Chain:
     arrays: dict[str, Array] = field(default_factory=dict)
     facts: dict[str, Facts] = field(default_factory=dict)
 
-    def run(self, op: str, params: Mapping[str, Any], files: Mapping[str, Path] | None = None) -> Facts:
+    def run(self, op: str, params: Facts, files: Mapping[str, Path] | None = None) -> Facts:
         """Run an operation on these files and on earlier arrays; InputError if that is impossible."""
         step, arrays, self.facts[op] = OPERATIONS[op].run(params, files or {}, self.arrays)
         self.steps.append(step)

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 
 REACH_PX = 8.0
 """Distances are clipped to this many pixels of the micrograph."""

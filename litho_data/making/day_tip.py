@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.making.jobs import FieldJob
 from litho_data.sharing.workers import Workers, run_jobs
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius

@@ -3,8 +3,7 @@
 from typing import Any
 
 from litho_data.cards.card import KnownGrating
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.results import Record
 from litho_data.roughness import axis_scales, find_wave, line_bow
 from litho_data.store.read import Store

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.register.resample import line_variance_factor, noise_variance_factor, transfer_error
 from litho_data.register.topography import fill_gaps
 from litho_data.register.warp_error import warp_error

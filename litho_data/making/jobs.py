@@ -3,7 +3,6 @@
 Jobs are sent to other processes and machines, so they contain only paths and plain parameters.
 """
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -11,9 +10,7 @@ import numpy as np
 
 from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.making.chain import Chain
 from litho_data.making.operations import OPERATIONS
@@ -41,23 +38,15 @@ class Job(Protocol):
         """Make the piece; InputError if the files do not allow it."""
 
 
-@dataclass(frozen=True)
-class Skipped:
-    """A field that could not be used, and why."""
-
-    id: str
-    reason: str
-
-
-def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
+def finish(job: Job, unfinished: PartialStore) -> Facts | str:
     """Run a job, keep its piece and return the record of the piece; arrays stay where they are made.
 
-    Bad input becomes a reason for skipping, so one bad file never stops a build.
+    Bad input becomes a reason for skipping, as a text, so one bad file never stops a build.
     """
     try:
         piece = job.run()
     except InputError as error:
-        return Skipped(job.id, str(error))
+        return str(error)
     unfinished.add(piece)
     return piece.record
 
@@ -71,7 +60,7 @@ class FieldJob:
 
     field: PrintedField
     card: Card
-    recipe: Mapping[str, Any]
+    recipe: Facts
     scan_name: str
     layout_name: str | None
     seed: int = 0
@@ -223,7 +212,7 @@ class FieldJob:
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 
 
-def field_jobs(listing: Listing, recipe: Mapping[str, Any], seed: int = 0) -> list[FieldJob]:
+def field_jobs(listing: Listing, recipe: Facts, seed: int = 0) -> list[FieldJob]:
     """The jobs of a card, in the order of its ids."""
     standards = standards_of(listing)
     return [

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
-from litho_data.making.step import Facts, Files, Function, Inputs, Made, Operation, Params
+from litho_data.foundation import Array, Facts, InputError
+from litho_data.making.step import Files, Function, Inputs, Made, Operation, Params
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
@@ -77,8 +76,9 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     arrays = {"raw_height_um": scan.height_um.astype(np.float32)}
     if scan.mask is not None:
         arrays["vendor_mask"] = scan.mask
-    facts: Facts = {"notes": list(scan.notes)} if scan.notes else {}
-    facts |= {
+    notes = {"notes": list(scan.notes)} if scan.notes else {}
+    return arrays, {
+        **notes,
         "pitch_um": list(scan.require_pitch()),
         "reader": scan.format,
         "unit": scan.unit,
@@ -86,7 +86,6 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
         "fast_axis": scan.fast_axis,
         "header": scan.header,
     }
-    return arrays, facts
 
 
 @_operation("read-micrograph", "", "readers")
@@ -142,10 +141,11 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.making.calibration import SCALES, measure_scales
 
     found = measure_scales(params["standards"], files)
-    facts: Facts = {}
-    for scale, (factor, uncertainty) in zip(SCALES, found.tolist(), strict=True):
-        facts |= {f"scale_{scale}": factor, f"scale_{scale}_uncertainty": uncertainty}
-    return {"calibration": found}, facts
+    return {"calibration": found}, {
+        f"scale_{scale}{ending}": value
+        for scale, pair in zip(SCALES, found.tolist(), strict=True)
+        for ending, value in zip(("", "_uncertainty"), pair, strict=True)
+    }
 
 
 def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
@@ -208,7 +208,7 @@ def _require_found(found: Registration, params: Params, when: str = "") -> None:
         raise InputError(f"{UNREGISTERED}{when}: {found.quality.reason}", hint=pixels if oblong else "")
 
 
-def _registration(height_um: Array, layout_level: Array, params: Mapping[str, Any]) -> Registration:
+def _registration(height_um: Array, layout_level: Array, params: Facts) -> Registration:
     from litho_data.register import register_scan
 
     return register_scan(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.files import atomic_file
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, atomic_file, table_beside
 from litho_data.making.gratings import GratingScan, grating_scans
 from litho_data.making.verdict import verdict_of
 from litho_data.reports.page import Page
@@ -32,7 +30,7 @@ _STAGES = {
     "residual (nm)": "RdBu_r",
 }
 # The columns of each table in order, each with its title and meaning.
-_COLUMNS = tomllib.loads(Path(__file__).with_name("columns.toml").read_text(encoding="utf-8"))
+_COLUMNS = table_beside(__file__, "columns.toml")
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
@@ -81,7 +79,11 @@ def _left_out(page: Page, result: BuildResult) -> None:
         table = [{"scan": one.scan, "what": one.text} for one in result.findings]
         page.table(table, "Findings against the dataset, worst first", "findings.csv")
     apart = {"skipped": result.skipped, "unpaired": result.unpaired}
-    rows = [{"id": one.id, "status": how, "reason": one.reason} for how, ids in apart.items() for one in ids]
+    rows = [
+        {"id": key, "status": how, "reason": reason}
+        for how, reasons in apart.items()
+        for key, reason in reasons.items()
+    ]
     if rows:
         page.heading("Not in the store")
         caption = "Ids that are not in the store, and why; with --strict the build is refused instead"

@@ -3,22 +3,16 @@
 from pathlib import Path
 from typing import Any, ClassVar
 
-from litho_data.foundation.results import Record, Result
+from litho_data.foundation.results import Result
 from litho_data.making.verdict import Finding
 from litho_data.store.schema import DatasetId
-
-
-class LeftOut(Record):
-    """An id that is not in the store, with the reason."""
-
-    id: str
-    reason: str
 
 
 class BuildResult(Result):
     """Scans that a build made or left out; ``reused`` scans were finished by an earlier build.
 
-    ``findings``: things to fix, worst first.
+    ``skipped`` and ``unpaired`` map ids that are not in the store to reasons; ``findings``: things to fix,
+    worst first.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"
@@ -28,8 +22,8 @@ class BuildResult(Result):
     dataset: DatasetId
     n_scans: int
     n_references: int
-    skipped: list[LeftOut]
-    unpaired: list[LeftOut]
+    skipped: dict[str, str]
+    unpaired: dict[str, str]
     reused: int
     findings: list[Finding]
     seconds: float

@@ -8,11 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, Facts
 from litho_data.register.orientation import search_orientation
 from litho_data.register.refine import interior_of
 from litho_data.register.scan import at_layout_pitch
@@ -53,9 +52,7 @@ class Print:
     group: float | str
 
 
-def prints_of(
-    records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, Array]]
-) -> list[Print]:
+def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array]]) -> list[Print]:
     """The registered scans among the records, at a few points.
 
     Args:
@@ -96,7 +93,7 @@ def fitting_layout(
     return fitting if best >= _FITS and best - rival > _LEAD else ""
 
 
-def _print(record: Mapping[str, Any], arrays: Mapping[str, Array]) -> Print:
+def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
     level = arrays["mask_level"]
     step = max(1, -(-max(level.shape) // _SIDE_PX))
     sparse = (slice(step // 2, None, step),) * 2

@@ -9,16 +9,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import array_sha256, file_sha256, record_sha256, source_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, InputError, array_sha256, file_sha256, record_sha256
+from litho_data.foundation.hashes import source_sha256
 from litho_data.store.schema import VARIABLES
 
 PACKAGE = Path(__file__).parents[1]
 Arrays = dict[str, Array]
-Facts = dict[str, Any]
 # An operation: (parameters, raw files, input arrays by name) to arrays and facts.
-Params = Mapping[str, Any]
+Params = Facts
 Files = Sequence[Path]
 Inputs = Mapping[str, Array]
 Made = tuple[Arrays, Facts]
@@ -36,9 +34,9 @@ class Step:
 
     op: str
     op_version: str
-    params: Mapping[str, Any]
+    params: Facts
     inputs: tuple[Mapping[str, str], ...]
-    outputs: tuple[Mapping[str, Any], ...]
+    outputs: tuple[Facts, ...]
     code_sha256: str
 
     @property
@@ -52,7 +50,7 @@ class Step:
         return {"id": self.id, **asdict(self)}
 
     @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Step:
+    def from_record(cls, record: Facts) -> Step:
         """The step of a record; the recorded id is not used, so that it can be compared."""
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
@@ -83,7 +81,7 @@ class Operation:
         return _code_sha256(self.code)
 
     def run(
-        self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]
+        self, params: Facts, files: Mapping[str, Path], arrays: Mapping[str, Array]
     ) -> tuple[Step, Arrays, Facts]:
         """Run the operation; returns its record and its arrays.
 

@@ -13,9 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from litho_data.cards.listing import list_fields
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError, atomic_file
 from litho_data.level.recipe import Recipe
 from litho_data.making.jobs import FieldJob, field_jobs
 from litho_data.making.operations import load_recipe

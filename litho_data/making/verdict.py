@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
 from litho_data.cards.card import Card
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
@@ -80,7 +79,7 @@ def require_heights(prints: Sequence[Print], card: Card) -> None:
 
 
 def findings(
-    records: Sequence[Mapping[str, Any]],
+    records: Sequence[Facts],
     prints: Sequence[Print],
     doubts: Mapping[str, str],
     skipped: Mapping[str, str],
@@ -107,7 +106,7 @@ def findings(
     return sorted(found, key=lambda one: (one.weight, one.scan != ALL, one.scan))
 
 
-def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
+def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
     """What is wrong with one scan; ``spread_nm`` holds the standard deviation of the heights by id."""
     quality = record["quality"]
     for note in record.get("notes", ()):
@@ -126,7 +125,7 @@ def _of_a_scan(record: Mapping[str, Any], spread_nm: Mapping[str, float]) -> Ite
 
 
 def _of_the_card(
-    records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
+    records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
     """Numbers of the card that the scans together contradict: the scan or all scans, the text, the weight."""
     layout = card.layout
@@ -164,7 +163,7 @@ def _of_the_card(
         yield ALL, text, Weight.HEIGHT
 
 
-def _scale(record: Mapping[str, Any]) -> float:
+def _scale(record: Facts) -> float:
     """Scale factor of a scan onto its layout; 0 if it was not registered."""
     low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
     return float(low * high) ** 0.5 if low * high > 0 else 0.0

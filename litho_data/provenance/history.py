@@ -11,9 +11,7 @@ import numpy as np
 
 from litho_data.cards.fetch import known_folders
 from litho_data.commands.progress import progress
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError, file_sha256, require_known
 from litho_data.making.operations import OPERATIONS
 from litho_data.making.step import Step
 from litho_data.store.access import group_of, read_table

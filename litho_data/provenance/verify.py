@@ -1,7 +1,7 @@
 """``verify``: is a store unchanged since its build, and are its raw files unchanged?"""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from litho_data.commands.progress import progress
-from litho_data.foundation.errors import InputError, damaged
-from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation import Facts, InputError, damaged, file_sha256, record_sha256
 from litho_data.making.assemble import root_attributes, table_sha256
 from litho_data.making.operations import OPERATIONS
 from litho_data.provenance.history import Recorded, raw_folder, read_steps, require_folder, stored_array
@@ -214,7 +213,7 @@ def _other_code(history: Recorded) -> Iterator[str]:
         yield f"made by code other than the installed: {', '.join(sorted(other))}; replay tells if it matters"
 
 
-def _raw_file(folder: Path, row: Mapping[str, Any]) -> Iterator[Finding]:
+def _raw_file(folder: Path, row: Facts) -> Iterator[Finding]:
     path = folder / row["path"]
     if not path.is_file():
         yield Finding(f"raw file {row['path']}", f"is not in {folder}")

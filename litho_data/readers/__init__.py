@@ -2,13 +2,12 @@
 
 from litho_data.readers.layout import read_layout
 from litho_data.readers.read import list_channels, read_scan
-from litho_data.readers.reader import Channel, Reader, foreign_parser
+from litho_data.readers.reader import Channel, Reader
 from litho_data.readers.registry import formats, register_reader
 
 __all__ = [
     "Channel",
     "Reader",
-    "foreign_parser",
     "formats",
     "list_channels",
     "read_layout",

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
-from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
+from litho_data.foundation import Array, Facts, InputError, Shape, is_length, um_per
+from litho_data.readers.reader import Channel, Loaded, Reader, one_by_one
 
 _NUMBERS = "uif"
 _MATLAB_7 = b"MATLAB 7.3 MAT-file"
@@ -43,6 +40,9 @@ _UNEVEN = 1e-3
 _OF_DIMENSIONS = ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates")
 _DIMENSIONS = ("_ARRAY_DIMENSIONS", "axes")
 _NO_COORDINATE = b"This is a netCDF dimension but not"
+
+
+Read = Callable[[], Array]
 
 
 @dataclass(frozen=True)
@@ -73,28 +73,46 @@ class Coordinate:
         return abs(float(steps.mean())) * count
 
 
-def array_channel(
-    name: str,
-    dtype: np.dtype,
-    stored_shape: Shape,
-    raw: Callable[[], Array],
-    attributes: Mapping[str, Any],
-    dims: tuple[str, str] = ("", ""),
-    coordinates: Mapping[str, Coordinate] | None = None,
-    around: Mapping[str, Any] | None = None,
-) -> Channel:
+@dataclass(frozen=True)
+class Held:
+    """An array in a file: type, shape, how to read it, and what the file says about it.
+
+    ``dims``: names of its dimensions; ``coordinates``: along these, or others of the file; ``around``: the
+    attributes beside and above it.
+    """
+
+    dtype: np.dtype
+    shape: Shape
+    read: Read
+    attributes: Facts = field(default_factory=dict)
+    dims: tuple[str, ...] = ("", "")
+    coordinates: Mapping[str, Coordinate] = field(default_factory=dict)
+    around: Facts = field(default_factory=dict)
+
+    @classmethod
+    def in_memory(cls, values: Array, *described: Any) -> Held:
+        """An array that was read already."""
+        native = np.array(values, dtype=values.dtype.newbyteorder("="))
+        return cls(native.dtype, native.shape, partial(np.array, native), *described)
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it holds numbers along two dimensions."""
+        return self.dtype.kind in f"{_NUMBERS}c" and len(self.shape) == 2 and min(self.shape) > 1
+
+
+def array_channel(name: str, held: Held) -> Channel:
     """Make the channel of a two-dimensional array, which is [y, x] unless the names of its dimensions differ.
 
-    ``raw`` reads its values; ``around`` contains the attributes beside and above it. x grows to the right.
-    Rows keep the order of the file, even if their coordinate decreases.
+    x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
 
     Raises:
         InputError: attributes that change the values in an unknown way, which the message names; values that
             are no real numbers; coordinates at uneven steps.
     """
-    says = {key: _plain(value) for key, value in attributes.items()}
-    beside = {key: _plain(value) for key, value in (around or {}).items()}
-    counts = dtype.kind in "ui"
+    says = {key: _plain(value) for key, value in held.attributes.items()}
+    beside = {key: _plain(value) for key, value in held.around.items()}
+    counts = held.dtype.kind in "ui"
     unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value, counts)]
     unknown += [
         f"{key} = {value}"
@@ -105,12 +123,11 @@ def array_channel(
         raise InputError(
             "values", got=", ".join(unknown), wanted="scale_factor and add_offset, or plain values"
         )
-    if dtype.kind not in _NUMBERS:
-        raise InputError("values", got=dtype, wanted="integers or real numbers")
-    known = coordinates or {}
-    (y, x), turned = _axes(dims, stored_shape, known)
-    shape = stored_shape[::-1] if turned else stored_shape
-    along = [known.get(dim, Coordinate(None, None)) for dim in (y, x)]
+    if held.dtype.kind not in _NUMBERS:
+        raise InputError("values", got=held.dtype, wanted="integers or real numbers")
+    (y, x), turned = _axes(held)
+    shape = held.shape[::-1] if turned else held.shape
+    along = [held.coordinates.get(dim, Coordinate(None, None)) for dim in (y, x)]
     extents = [one.extent(count) for one, count in zip(along, shape, strict=True)]
     units = [one.unit for one in along]
     size_um = extent = None
@@ -128,30 +145,29 @@ def array_channel(
         shape=shape,
         unit=str(unit) if unit not in (None, "", "1") else None,
         size_um=size_um,
-        load=partial(_values, raw, says, turned, mirrored),
-        full_scale=float(np.iinfo(dtype).max) if counts and not scaled else None,
+        load=partial(_values, held.read, says, turned, mirrored),
+        full_scale=float(np.iinfo(held.dtype).max) if counts and not scaled else None,
         header={key: str(value) for key, value in says.items()},
         x_is=f"the {'first' if turned else 'second'} index" + (f", {x}" if x else ""),
         extent=extent,
     )
 
 
-def _axes(
-    dims: tuple[str, str], shape: Shape, known: Mapping[str, Coordinate]
-) -> tuple[tuple[str, str], bool]:
+def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
     """The names of y and x, and whether the first index runs along x.
 
     Dimensions without coordinates take the coordinates called x and y if the lengths match.
     """
-    first, second = ((known[dim].axis if dim in known else "") or dim for dim in dims)
+    known = held.coordinates
+    first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
     turned = bool((_X.match(first) and not _X.match(second)) or (_Y.match(second) and not _Y.match(first)))
-    if not any(dim in known for dim in dims):
+    if not any(dim in known for dim in held.dims):
         lengths = {name: len(one.values) for name, one in known.items() if one.values is not None}
         y, x = (next((name for name in lengths if axis.match(name)), "") for axis in (_Y, _X))
         for other in (turned, not turned):
-            if y and x and (lengths[y], lengths[x]) == (shape[::-1] if other else shape):
+            if y and x and (lengths[y], lengths[x]) == (held.shape[::-1] if other else held.shape):
                 return (y, x), other
-    return (dims[1], dims[0]) if turned else dims, turned
+    return held.dims[::-1] if turned else held.dims, turned
 
 
 def _changes(key: str, value: Any, counts: bool) -> bool:
@@ -169,7 +185,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mirrored: bool) -> Loaded:
+def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
     """Mark missing pixels in the file's own numbers, then apply scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -181,49 +197,21 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool, mir
     return np.ascontiguousarray(values[:, :: -1 if mirrored else 1]), None
 
 
-@dataclass(frozen=True)
-class Held:
-    """An array in a file: type, shape, how to read it, and what the file says about it."""
+def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
+    """One channel per map in a file without groups; ``around`` is what the file says about all of them.
 
-    dtype: np.dtype
-    shape: Shape
-    read: Callable[[], Array]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    dims: tuple[str, ...] = ("", "")
-
-    @classmethod
-    def in_memory(cls, values: Array, *described: Any) -> Held:
-        """An array that was read already."""
-        native = np.array(values, dtype=values.dtype.newbyteorder("="))
-        return cls(native.dtype, native.shape, partial(np.array, native), *described)
-
-
-def channels_of(
-    path: Path, kind: str, held: Mapping[str, Held], around: Mapping[str, Any] | None = None
-) -> list[Channel]:
-    """One channel per two-dimensional array of numbers in a file.
-
-    Arrays along one dimension are coordinates, single values say something about all others, and so does
-    ``around``. A map with a mask beside it is refused.
+    Arrays along one dimension are coordinates, and single values say something about all others.
     """
-    numbers = {name: one for name, one in held.items() if one.dtype.kind in f"{_NUMBERS}c"}
-    lines = {
-        name: _coordinate(one.read().ravel(), one.attributes) for name, one in held.items() if _is_line(one)
-    }
-    single = {name: one.read().ravel()[0] for name, one in held.items() if _size(one) == 1}
-    masks = {one.shape: name for name, one in held.items() if one.dtype.kind == "b"}
+    lines = {name: _coordinate(one.read(), one.attributes) for name, one in arrays.items() if _is_line(one)}
+    single = {name: one.read().ravel()[0] for name, one in arrays.items() if _size(one) == 1}
+    masks = _masks(arrays.items())
 
     def channel(name: str, one: Held) -> Channel:
-        refuse_mask(one.shape, masks)
-        beside = {**(around or {}), **single}
-        dims = (one.dims[0], one.dims[1])
-        return array_channel(name, one.dtype, one.shape, one.read, one.attributes, dims, lines, beside)
+        _refuse_mask(one.shape, masks)
+        return array_channel(name, replace(one, coordinates=lines, around={**(around or {}), **single}))
 
-    return [
-        one_by_one(path, kind, name, partial(channel, name, one))
-        for name, one in numbers.items()
-        if len(one.shape) == 2 and min(one.shape) > 1
-    ]
+    maps = ((name, one) for name, one in arrays.items() if one.is_map)
+    return [one_by_one(name, partial(channel, name, one)) for name, one in maps]
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
@@ -233,27 +221,28 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
         lambda name, item: datasets.append(item) if len(getattr(item, "shape", ())) == 2 else None
     )
     matlab = b"MATLAB" in path.open("rb").read(16)
+    masks = _masks((item.name, item) for item in datasets)
+
+    def channel(item: Any) -> Channel:
+        _refuse_mask(item.shape, masks)
+        return array_channel(item.name.strip("/"), _hdf5_array(path, item, matlab))
+
     maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
-    masks = {item.shape: item.name for item in datasets if item.dtype.kind == "b"}
-    return [
-        one_by_one(path, "HDF5", item.name.strip("/"), partial(_hdf5_channel, path, item, matlab, masks))
-        for item in maps
-    ]
+    return [one_by_one(item.name.strip("/"), partial(channel, item)) for item in maps]
 
 
-def refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Refuse a map that has a mask beside it, because the meaning of the mask is unknown.
+def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
+    """The name of a mask by its shape."""
+    return {one.shape: name for name, one in arrays if one.dtype.kind == "b"}
 
-    Raises:
-        InputError: there is a mask of the map's shape.
-    """
+
+def _refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
+    """Refuse a map that has a mask of its shape beside it, because the meaning of the mask is unknown."""
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")
 
 
-def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str]) -> Channel:
-    refuse_mask(item.shape, masks)
-    raw = partial(_dataset, path, item.name)
+def _hdf5_array(path: Path, item: Any, matlab: bool) -> Held:
     scales = [list(item.dims[axis].values()) for axis in (0, 1)]
     dims = [
         item.dims[k].label or (at[0].name.rsplit("/", 1)[-1] if at else "") for k, at in enumerate(scales)
@@ -265,30 +254,21 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool, masks: Mapping[Shape, str
         stated = next((at[key] for at in (item.attrs, group.attrs) for key in _DIMENSIONS if key in at), "")
         names = re.split(r"[\s,:]+", stated) if isinstance(stated := _plain(stated), str) else stated
         dims = [_plain(name) for name in names] if len(names) == len(dims) else dims
-    held = {
+    along = {
         dim: _coordinate(at[0][()], at[0].attrs)
         for dim, at in zip(dims, scales, strict=True)
         if at and not bytes(at[0].attrs.get("NAME", b"")).startswith(_NO_COORDINATE)
     }
     near = {name: one for name, one in group.items() if getattr(one, "size", None)}
-    lines = {name: _coordinate(np.ravel(one[()]), one.attrs) for name, one in near.items() if _is_line(one)}
+    lines = {name: _coordinate(one[()], one.attrs) for name, one in near.items() if _is_line(one)}
     around = {name: one[()] for name, one in near.items() if one.size == 1}
-    while True:
+    while group.name != "/":
         around = {**group.attrs, **around}
-        if group.name == "/":
-            break
         group = group.parent
+    around = {**group.attrs, **around}
     attributes = {key: value for key, value in item.attrs.items() if key not in _OF_DIMENSIONS}
-    return array_channel(
-        item.name.strip("/"),
-        item.dtype,
-        item.shape,
-        raw,
-        attributes,
-        (dims[0], dims[1]),
-        held or lines,
-        around,
-    )
+    read = partial(dataset, path, item.name)
+    return Held(item.dtype, item.shape, read, attributes, tuple(dims), along or lines, around)
 
 
 def _is_line(array: Any) -> bool:
@@ -300,17 +280,19 @@ def _size(array: Any) -> int:
     return int(np.prod(array.shape))
 
 
-def _dataset(path: Path, name: str) -> Array:
+def dataset(path: Path, name: str) -> Array:
+    """The values of a dataset in an HDF5 file."""
     import h5py
 
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         return file[name][()]
 
 
-def _coordinate(values: Array, attributes: Mapping[str, Any]) -> Coordinate:
+def _coordinate(values: Array, attributes: Facts) -> Coordinate:
     unit = attributes.get("units", attributes.get("unit"))
     length = attributes.get("length")
-    numbers = np.asarray(values, dtype=float) if np.asarray(values).dtype.kind in _NUMBERS else None
+    line = np.ravel(values)
+    numbers = line.astype(float) if line.dtype.kind in _NUMBERS else None
     axis = str(_plain(attributes.get("axis", attributes.get("standard_name", ""))))
     return Coordinate(
         numbers,
@@ -324,14 +306,14 @@ def read_netcdf(path: Path) -> list[Channel]:
     """One channel per two-dimensional variable of a NetCDF 3 file; scale, unit and missing by CF's names."""
     from scipy.io import netcdf_file
 
-    with foreign_parser(path, "NetCDF"), netcdf_file(path, "r", mmap=False) as file:
+    with netcdf_file(path, "r", mmap=False) as file:
         held = {
             name: Held.in_memory(
                 np.array(one[:]) if one.shape else np.array(one.getValue()), one._attributes, one.dimensions
             )
             for name, one in file.variables.items()
         }
-        return channels_of(path, "NetCDF", held, dict(file._attributes))
+        return channels_of(held, dict(file._attributes))
 
 
 def read_matlab(path: Path) -> list[Channel]:
@@ -339,22 +321,17 @@ def read_matlab(path: Path) -> list[Channel]:
     if path.open("rb").read(len(_MATLAB_7)) == _MATLAB_7:
         import h5py
 
-        with foreign_parser(path, "MATLAB 7.3"), h5py.File(path) as file:
+        with h5py.File(path) as file:
             return read_hdf5(path, file)
     from scipy.io import loadmat
 
-    with foreign_parser(path, "MATLAB"):
-        found = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
-        held = {name: Held.in_memory(one) for name, one in found.items() if not one.dtype.hasobject}
-        return channels_of(path, "MATLAB", held)
+    found = {name: one for name, one in loadmat(path).items() if isinstance(one, Array)}
+    arrays = {name: Held.in_memory(one) for name, one in found.items() if not one.dtype.hasobject}
+    return channels_of(arrays)
 
 
-_IMPORTS = ("scipy.io", "h5py")
+_PARSERS = ("scipy.io", "h5py")
 NETCDF_READER = Reader(
-    "netcdf", lambda path, head: head.startswith((b"CDF\x01", b"CDF\x02")), confined(read_netcdf, _IMPORTS)
+    "netcdf", lambda path, head: head.startswith((b"CDF\x01", b"CDF\x02")), read_netcdf, _PARSERS
 )
-MATLAB_READER = Reader(
-    "matlab",
-    lambda path, head: head.startswith(b"MATLAB "),
-    confined(read_matlab, _IMPORTS),
-)
+MATLAB_READER = Reader("matlab", lambda path, head: head.startswith(b"MATLAB "), read_matlab, _PARSERS)

@@ -14,14 +14,15 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import Channel
+from litho_data.foundation import InputError
+from litho_data.readers.reader import DAMAGED, foreign_parser
+
+T = TypeVar("T")
 
 _MIB = 1 << 20
 # Intact files take a hundredth of this time and a tenth of this memory.
@@ -29,29 +30,22 @@ _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
 # Waiting time per computing time: a busy machine stays below it, a parser that waits for something does not.
 _WAITING_PER_COMPUTING = 20
-_OUT_OF_MEMORY = 3
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 
 
-def confined(
-    read_channels: Callable[[Path], list[Channel]], imports: tuple[str, ...]
-) -> Callable[[Path], list[Channel]]:
-    """Wrap a function so that it runs in the child process, together with the loading of its channels.
+def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, ...]) -> T:
+    """The result of a function that parses a file; any of its errors is one InputError about the file.
 
-    Without POSIX the function runs in this process.
-
-    Args:
-        read_channels: importable by name; the ``load`` of its channels can be pickled.
-        imports: modules that the child imports before the limits hold.
+    With ``parsers``, modules that it needs, it runs in the child process, and has to be picklable. Without
+    POSIX it runs in this process.
     """
-    if os.name != "posix":
-        return read_channels
+    guarded = partial(_guarded, function, kind)
+    return _CHILD.call(guarded, path, parsers) if parsers and os.name == "posix" else guarded()
 
-    def read(path: Path) -> list[Channel]:
-        channels = _CHILD.call(partial(read_channels, path), path, imports)
-        return [replace(one, load=partial(_CHILD.call, one.load, path, imports)) for one in channels]
 
-    return read
+def _guarded(function: Callable[[], T], kind: str) -> T:
+    with foreign_parser(kind):
+        return function()
 
 
 class _Child:
@@ -80,9 +74,7 @@ class _Child:
                     raise TimeoutError
                 result, refusal = self._pipe.recv()
             except (EOFError, OSError) as error:
-                raise InputError(
-                    f"cannot read {path}", got=self._end(error, computing_s), hint="the file may be damaged"
-                ) from error
+                raise InputError("cannot be read", got=self._end(error, computing_s), hint=DAMAGED) from error
             except BaseException:
                 self.stop()  # A late answer must not count as the answer for the next file.
                 raise
@@ -115,8 +107,6 @@ class _Child:
         code = self._process.wait()
         if code == -signal.SIGPROF or isinstance(error, TimeoutError):
             return f"no result after {computing_s:.0f} s of computing"
-        if code == _OUT_OF_MEMORY:
-            return "a parser that asked for more memory than such a file can need"
         return f"a parser that crashed (exit code {code})"
 
     def stop(self) -> None:
@@ -143,8 +133,6 @@ def serve(descriptor: int) -> None:
                     answer = function(), ""
             except InputError as error:
                 answer = None, str(error)
-            except MemoryError:
-                os._exit(_OUT_OF_MEMORY)
             pipe.send(answer)
 
 

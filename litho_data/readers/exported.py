@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation import Array, Facts, InputError, Shape, damaged, file_sha256
 from litho_data.foundation.files import read_text
-from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.gds_rows import GdsRows
 
 _SCHEMA = "litho-design/export/"
@@ -38,7 +37,7 @@ def export_of(file: Path) -> dict[str, Any]:
     return says
 
 
-def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
+def exported_levels(path: Path, says: Facts) -> Array:
     """Levels of the element alone, uint8 (ny, nx), row 0 on top.
 
     Raises:
@@ -51,7 +50,7 @@ def exported_levels(path: Path, says: Mapping[str, Any]) -> Array:
     return levels
 
 
-def exported_rows(path: Path, says: Mapping[str, Any]) -> Any:
+def exported_rows(path: Path, says: Facts) -> Any:
     """The levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
 
     Raises:
@@ -109,40 +108,19 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Levels uint8 (ny, nx), row 0 on top, from closed polylines."""
+    """Levels uint8 (ny, nx), row 0 on top, from closed polylines; each begins with its layer and a dummy."""
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)
-    layer, x, corners = 0, 0.0, []
-    for code, value in _pairs(path):
-        if code == "8":
-            layer = int(value)
-        elif code == "10":
-            x = float(value)
-        elif code == "20":
-            corners.append((x / pitch_um, shape[0] - float(value) / pitch_um))
-        elif value == "POLYLINE":
-            corners = []
-        elif value == "SEQEND":
-            (left, top), (right, bottom) = (
-                np.rint(edge(corners[1:], axis=0)).astype(int) for edge in (np.min, np.max)
-            )
-            found[top:bottom, left:right] = level_of[layer]
+    for polyline in path.read_text("ascii").split("POLYLINE")[1:]:
+        corners = np.array(re.findall(r"\n10\n(.*)\n20\n(.*)", polyline)[1:], float) / pitch_um
+        left, low = np.rint(corners.min(axis=0)).astype(int)
+        right, high = np.rint(corners.max(axis=0)).astype(int)
+        found[shape[0] - high : shape[0] - low, left:right] = level_of[int(polyline.split()[1])]
     return found
 
 
-def _pairs(path: Path) -> Iterator[tuple[str, str]]:
-    with open(path, encoding="ascii") as stream:
-        for code in stream:
-            yield code.strip(), next(stream).strip()
-
-
 def _gwl_levels(
-    path: Path,
-    shape: Shape,
-    pitch_um: float,
-    level_height_um: float,
-    pedestal_um: float,
-    slicing_um: float,
+    path: Path, shape: Shape, pitch_um: float, level_height_um: float, pedestal_um: float, slicing_um: float
 ) -> Array:
     """Levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
 
@@ -193,28 +171,16 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Levels per cell uint8 (ny, nx), row 0 on top, from the flat faces on top of the solid.
+    """Levels per cell uint8 (ny, nx), row 0 on top, from the faces on top of the solid, each in one cell.
 
-    Along the middle of every row of cells each face covers the cells between two of its edges.
+    Raises:
+        InputError: a cell without a face on top.
     """
     corners = read_stl_triangles(path).astype(np.float64)
     flat = corners[(np.ptp(corners[..., 2], axis=1) == 0) & (corners[:, 0, 2] > 0)]
-    level = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um).astype(np.int64)
-    places = flat[..., :2] / cell_um
-    first, last = (np.ceil(edge(places[..., 1], axis=1) - 0.5).astype(int) for edge in (np.min, np.max))
-    face = np.repeat(np.arange(len(flat)), last - first)
-    row = np.arange(len(face)) + np.repeat(last - np.cumsum(last - first), last - first)
-    ends = np.array([[np.inf], [-np.inf]]).repeat(len(face), 1)
-    for one, other in ((0, 1), (1, 2), (2, 0)):
-        low, high = places[face, one], places[face, other]
-        # Computed from the lower end in every face, so that both faces at an edge get the same number.
-        down = (low[:, 1] > high[:, 1])[:, None]
-        (x0, y0), (x1, y1) = np.where(down, high, low).T, np.where(down, low, high).T
-        met = (y0 <= row + 0.5) & (row + 0.5 < y1)
-        x = x0[met] + (row[met] + 0.5 - y0[met]) / (y1 - y0)[met] * (x1 - x0)[met]
-        ends[0, met], ends[1, met] = np.minimum(ends[0, met], x), np.maximum(ends[1, met], x)
-    begin, end = np.ceil(ends - 0.5).astype(int)
-    steps = np.zeros((shape[0], shape[1] + 1), np.int64)
-    np.add.at(steps, (row, begin), level[face])
-    np.add.at(steps, (row, end), -level[face])
-    return steps.cumsum(1)[::-1, :-1].astype(np.uint8)
+    column, row = np.floor(flat[..., :2].mean(axis=1) / cell_um).astype(int).T
+    found = np.full(shape, -1)
+    found[shape[0] - 1 - row, column] = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um)
+    if found.min() < 0:
+        raise InputError(f"STL {path}", got="a cell without a top", wanted="a face on top of every cell")
+    return found.astype(np.uint8)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 
 _UNIT_M, _PRECISION_M = 1e-6, 1e-9
 # Side of the blocks that a part is cut into.

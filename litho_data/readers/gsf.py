@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.readers.reader import Channel, Reader, extent_um
 from litho_data.readers.text_blocks import refuse_scales
 
@@ -22,18 +21,17 @@ def read_channels(path: Path) -> list[Channel]:
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
-        raise InputError(f"{path} is no Gwyddion Simple Field", got=repr(raw[:25]), wanted=repr(_MAGIC))
+        raise InputError("no Gwyddion Simple Field", got=repr(raw[:25]), wanted=repr(_MAGIC))
     header_end = raw.find(b"\0")
-    header = _parse_header(path, raw[len(_MAGIC) : header_end if header_end >= 0 else None])
-    with about(str(path)):
-        refuse_scales(header)
-    shape = (_count(path, header, "YRes"), _count(path, header, "XRes"))
+    header = _parse_header(raw[len(_MAGIC) : header_end if header_end >= 0 else None])
+    refuse_scales(header)
+    shape = (_count(header, "YRes"), _count(header, "XRes"))
     # At least one NUL, even if the header already ends on a multiple of four.
     start = (header_end // _ITEM + 1) * _ITEM
     wanted = shape[0] * shape[1] * _ITEM
     if header_end < 0 or len(raw) - start != wanted:
         raise InputError(
-            f"{path}: bytes of data",
+            "bytes of data",
             got=0 if header_end < 0 else len(raw) - start,
             wanted=f"{wanted} for {shape[0]} x {shape[1]} pixels",
             hint="the file may be truncated",
@@ -51,21 +49,21 @@ def read_channels(path: Path) -> list[Channel]:
     ]
 
 
-def _parse_header(path: Path, text: bytes) -> dict[str, str]:
+def _parse_header(text: bytes) -> dict[str, str]:
     header = {}
     for number, line in enumerate(text.decode("utf-8", errors="replace").splitlines(), start=2):
         key, equals, value = line.partition("=")
         if line.strip() and not equals:
-            raise InputError(f"{path} line {number}", got=repr(line[:40]), wanted="name = value")
+            raise InputError(f"line {number}", got=repr(line[:40]), wanted="name = value")
         if equals:
             header[key.strip()] = value.strip()
     return header
 
 
-def _count(path: Path, header: dict[str, str], key: str) -> int:
+def _count(header: dict[str, str], key: str) -> int:
     text = header.get(key)
     if text is None or not text.isascii() or not text.isdigit() or len(text) > 9:
-        raise InputError(f"{path}: {key}", got=text, wanted="a number of pixels")
+        raise InputError(key, got=text, wanted="a number of pixels")
     return int(text)
 
 

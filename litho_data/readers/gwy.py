@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
-from litho_data.readers.reader import DAMAGED, Channel, Loaded, Reader, extent_um, one_by_one
+from litho_data.foundation import Array, InputError, Shape
+from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, one_by_one
 
 _MAGIC = b"GWYP"
 # Types of single values; the capital letter stands for an array of the same type.
@@ -25,29 +24,25 @@ def read_channels(path: Path) -> list[Channel]:
     channel is its header.
 
     Raises:
-        InputError: another format, or sizes of components that do not fit into each other.
+        InputError: another format.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
-        raise InputError(f"{path} is no Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
-    try:
-        content, end = _object(data, len(_MAGIC), len(data))
-        if end != len(data):
-            raise ValueError(f"{len(data)} bytes where {end} are wanted")
-    except (ValueError, struct.error, RecursionError) as error:
-        wanted = "a tree of Gwyddion components"
-        raise InputError(f"{path} is damaged", got=error, wanted=wanted, hint=DAMAGED) from error
+        raise InputError("no Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
+    content, end = _object(data, len(_MAGIC), len(data))
+    if end != len(data):
+        raise EOFError(f"{len(data)} bytes where {end} are wanted")
     numbers = sorted(
         (found[1] for key in content if (found := _FIELD_KEY.fullmatch(key))), key=lambda one: (len(one), one)
     )
     titles = [str(content.get(f"/{number}/data/title", f"channel {number}")) for number in numbers]
     return [
-        one_by_one(path, "GWY", title, partial(_channel, path, content, number, title))
+        one_by_one(title, partial(_channel, content, number, title))
         for number, title in zip(numbers, titles, strict=True)
     ]
 
 
-def _channel(path: Path, content: dict[str, Any], number: str, title: str) -> Channel:
+def _channel(content: dict[str, Any], number: str, title: str) -> Channel:
     field, mask = content[f"/{number}/data"], content.get(f"/{number}/mask")
     shape = (int(field["yres"]), int(field["xres"]))
     return Channel(
@@ -55,7 +50,7 @@ def _channel(path: Path, content: dict[str, Any], number: str, title: str) -> Ch
         shape=shape,
         unit=_unit(field, "si_unit_z"),
         size_um=extent_um(field.get("yreal", 0), field.get("xreal", 0), _unit(field, "si_unit_xy")),
-        load=partial(_load, f"{path} {title}", field, mask, shape),
+        load=partial(_load, title, field, mask, shape),
         header={key: str(value) for key, value in content.get(f"/{number}/meta", {}).items()},
     )
 
@@ -81,12 +76,12 @@ def _object(data: bytes, start: int, limit: int) -> tuple[dict[str, Any], int]:
     """The components of an object by name, and where it ends.
 
     Raises:
-        ValueError, struct.error: a size that does not fit.
+        EOFError, struct.error: a size that does not fit.
     """
     _, at = _text(data, start, limit)
     end, at = at + 4 + _count(data, at), at + 4
     if end > limit:
-        raise ValueError(f"an object at {start} reaches beyond its end")
+        raise EOFError(f"an object at {start} reaches beyond its end")
     found: dict[str, Any] = {}
     while at < end:
         name, at = _text(data, at, end)
@@ -108,10 +103,10 @@ def _component(data: bytes, kind: str, at: int, limit: int) -> tuple[Any, int]:
             parts.append(part)
         return parts, at
     if kind.lower() not in _NUMBERS:
-        raise ValueError(f"{kind!r} at {at} is no type of component")
+        raise EOFError(f"{kind!r} at {at} is no type of component")
     form = np.dtype(_NUMBERS[kind.lower()])
     if at + count * form.itemsize > limit:
-        raise ValueError(f"a component at {at} reaches beyond its end")
+        raise EOFError(f"a component at {at} reaches beyond its end")
     values = np.frombuffer(data, form, count, at)
     return values[0] if kind.islower() else values, at + count * form.itemsize
 
@@ -124,7 +119,7 @@ def _text(data: bytes, start: int, limit: int) -> tuple[str, int]:
     """The text before the closing NUL, and the position after it."""
     end = data.find(b"\0", start, limit)
     if end < 0:
-        raise ValueError(f"a string at {start} does not end")
+        raise EOFError(f"a string at {start} does not end")
     return data[start:end].decode("utf-8", errors="replace"), end + 1
 
 

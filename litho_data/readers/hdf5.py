@@ -6,20 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import InputError, Shape
 from litho_data.readers import vendor
-from litho_data.readers.arrays import read_hdf5
-from litho_data.readers.confined import confined
-from litho_data.readers.reader import (
-    Channel,
-    Loaded,
-    Reader,
-    extent_um,
-    foreign_parser,
-    in_memory,
-    one_by_one,
-)
+from litho_data.readers.arrays import Read, dataset, read_hdf5
+from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, in_memory, one_by_one
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _JPK = b"JPK SCAN"
@@ -46,7 +36,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     import h5py
 
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
+    with h5py.File(path) as file:
         if file.attrs.get("file-format-info") == _JPK:
             channels = [channel for name in sorted(file) for channel in _jpk_channels(path, file[name])]
         elif "topostats_file_version" in file:
@@ -65,20 +55,22 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
     grid = {key: measurement.attrs[f"position-pattern.grid.{key}"] for key in ("ilength", "jlength")}
     size_m = [float(measurement.attrs[f"position-pattern.grid.{key}length"]) for key in "vu"]
     shape = int(grid["jlength"]), int(grid["ilength"])
+    positions = partial(dataset, path, f"{measurement.name}/Position_Indices")
     channels = []
     for group in (measurement[name] for name in sorted(measurement) if name.startswith("Channel_")):
         says = {key: _text(value) for key, value in group.attrs.items()}
+        line = [float(group.attrs[f"net-encoder.scaling.{key}"]) for key in ("multiplier", "offset")]
         name = says["channel.fancy-name"] + (", retrace" if says.get("retrace") == "true" else "")
         for values in (one for key, one in sorted(group.items()) if key != "thumbnail"):
             if values.shape[0] != shape[0] * shape[1]:
-                raise InputError(f"{path} {values.name}: pixels", got=values.shape[0], wanted=shape)
+                raise InputError(f"{values.name}: pixels", got=values.shape[0], wanted=shape)
             channels += [
                 Channel(
                     name=name if values.shape[1] == 1 else f"{name}, frame {frame + 1}",
                     shape=shape,
                     unit=says["net-encoder.scaling.unit.unit"],
                     size_um=(size_m[0] * _UM_PER_M, size_m[1] * _UM_PER_M),
-                    load=partial(_load_jpk, path, values.name, frame),
+                    load=partial(_load_jpk, partial(dataset, path, values.name), positions, frame, *line),
                     fast_axis="x",
                     header=says,
                 )
@@ -87,18 +79,12 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
     return channels
 
 
-def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
+def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: float) -> Loaded:
     """Values in the default calibration; y of the grid points up, so its last row comes first."""
-    import h5py
-
-    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
-        counts, scaling = file[name], file[name].parent.attrs
-        measurement = file[name].parent.parent
-        column, row = measurement["Position_Indices"][()].astype(int).T
-        values = np.full((row.max() + 1, column.max() + 1), np.nan)
-        values[row.max() - row, column] = counts[:, frame]
-        slope, offset = (scaling[f"net-encoder.scaling.{key}"] for key in ("multiplier", "offset"))
-    return values * float(slope) + float(offset), None
+    column, row = positions().astype(int).T
+    values = np.full((row.max() + 1, column.max() + 1), np.nan)
+    values[row.max() - row, column] = counts()[:, frame]
+    return values * slope + offset, None
 
 
 def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
@@ -114,7 +100,7 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
                     label = _text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
                     name = ", ".join(filter(None, (_text(_first(item.attrs, _NAMES)), label)))
                     make = partial(_nanosurf_channel, path, item, says, name)
-                    channels.append(one_by_one(path, "NHF", name, make))
+                    channels.append(one_by_one(name, make))
     return channels
 
 
@@ -129,6 +115,7 @@ def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) ->
     if item.shape not in ((ny, nx), (ny * nx,)):
         raise InputError(f"{item.name}: shape", got=item.shape, wanted=f"{ny} lines of {nx} points")
     low, high, unit = (_first(item.attrs, names) for names in (_LOW, _HIGH, _UNIT))
+    read = partial(dataset, path, item.name)
     if item.dtype.kind not in "iu" or low is None or high is None or unit is None:
         raise InputError(
             f"{item.name}: calibration", got=f"{item.dtype}, {low} to {high} {unit}", wanted="counts"
@@ -138,7 +125,7 @@ def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) ->
         shape=(ny, nx),
         unit=_text(unit) or "not a length",
         size_um=extent_um(y_m, x_m, "m"),
-        load=partial(_load_nanosurf, path, item.name, (ny, nx), (float(low), float(high))),
+        load=partial(_load_nanosurf, read, (ny, nx), float(low), float(high), item.fillvalue),
         header={key: _text(value) for key, value in {**says, **item.attrs}.items()},
     )
 
@@ -147,14 +134,11 @@ def _first(attributes: Any, names: tuple[str, ...]) -> Any:
     return next((attributes[name] for name in names if name in attributes), None)
 
 
-def _load_nanosurf(path: Path, name: str, shape: Shape, range_: tuple[float, float]) -> Loaded:
-    import h5py
-
-    with foreign_parser(path, "NHF"), h5py.File(path) as file:
-        counts, fill = file[name][()].reshape(shape), file[name].fillvalue
+def _load_nanosurf(read: Read, shape: Shape, low: float, high: float, fill: Any) -> Loaded:
+    counts = read().reshape(shape)
     info = np.iinfo(counts.dtype)
-    values = (counts.astype(float) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
-    return np.where(counts == fill, np.nan, values + range_[0]) if fill else values + range_[0], None
+    values = low + (counts.astype(float) - info.min) / (float(info.max) - info.min) * (high - low)
+    return np.where(counts == fill, np.nan, values) if fill else values, None
 
 
 def _topostats_channel(file: Any, name: str) -> Channel:
@@ -176,5 +160,5 @@ def _text(value: Any) -> str:
 
 
 READER = Reader(
-    "hdf5", lambda path, head: head.startswith(_MAGIC), confined(read_channels, ("h5py", *vendor.IMPORTS))
+    "hdf5", lambda path, head: head.startswith(_MAGIC), read_channels, ("h5py", *vendor.READER.parsers)
 )

@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.exported import export_of, exported_levels
 from litho_data.readers.picture import read_picture, value_range
 from litho_data.readers.registry import require_file
 
-_LARGEST_LEVEL = 255
 _WHITE = (255, 65535)
 
 
@@ -21,7 +19,7 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Levels of a layout, uint8 (ny, nx), row 0 on top.
+    """Levels of a layout, uint8 (beyond 256 levels uint16) (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
     grey if its colours are identical. A file that the design package exported, in any format, is read with
@@ -30,8 +28,8 @@ def read_layout(
     Args:
         path: the file.
         grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
-        levels: number of levels. A picture with larger values is taken as one whose white is the highest
-            level, if all its values are whole steps.
+        levels: number of levels, by default at most 256. A picture with larger values is taken as one whose
+            white is the highest level, if all its values are whole steps.
         average_px: for a picture in two greys: each square of this many pixels a side becomes one pixel of
             the layout, whose level is the number of lighter pixels in the square; a remainder at right and
             bottom is cut off.
@@ -47,14 +45,15 @@ def read_layout(
     if average_px is not None:
         return _averaged(file, pixels, average_px)
     step = grey_per_level or _white_step(pixels, levels)
-    found = np.rint(pixels / step)
+    found, kind = np.rint(pixels / step), np.min_scalar_type((levels or 256) - 1)
+    largest = np.iinfo(kind).max
     if (
         np.abs(pixels - found * step).max() > 0.5 * (step > 1)
-        or not 0 <= found.min() <= found.max() <= _LARGEST_LEVEL
+        or not 0 <= found.min() <= found.max() <= largest
     ):
-        wanted = "integer levels from 0 to 255" if step == 1 else f"steps of {step:g} per level"
+        wanted = f"integer levels from 0 to {largest}" if step == 1 else f"steps of {step:g} per level"
         raise InputError(f"layout {file}: values", got=value_range(pixels), wanted=wanted)
-    return found.astype(np.uint8)
+    return found.astype(kind)
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:

@@ -1,12 +1,10 @@
 """Handle missing pixels that a file marks by a number or a word; the caller must name the mark."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.reader import Channel
 from litho_data.readers.text_blocks import WORDS
 
@@ -22,13 +20,10 @@ _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
-def without_missing(
-    file: Path, channel: Channel, values: Array, missing: Sequence[float | str] | None
-) -> Array:
+def without_missing(channel: Channel, values: Array, missing: Sequence[float | str] | None) -> Array:
     """The values with NaN where they mark a missing pixel.
 
     Args:
-        file: for messages.
         channel: what was read.
         values: (ny, nx) as in the file.
         missing: the numbers and words that mark missing pixels; None if the caller does not say, an empty
@@ -42,7 +37,7 @@ def without_missing(
         if word not in marks:
             shown = f"{word[:24]!r}" if word else "an empty cell"
             hint = f'if it marks pixels without a measurement: missing = ["{word[:24]}"]'
-            raise InputError(f"{file} line {line}", got=shown, wanted="a number", hint=hint)
+            raise InputError(f"line {line}", got=shown, wanted="a number", hint=hint)
     values = np.array(values, dtype=float)
     for number in (one for one in missing or () if not isinstance(one, str)):
         tolerance = _SAME_OF_LARGE if abs(number) > _LARGE else _SAME
@@ -51,7 +46,7 @@ def without_missing(
         shown = ", ".join(f"{value:g} in {count} pixels" for value, count in found)
         keys = ", ".join(f"{value:.8g}" for value, _ in found)
         hint = f"if it marks pixels without a measurement: missing = [{keys}]; if not: missing = []"
-        raise InputError(f"{file}: heights", got=f"{shown}, far from all others", wanted="heights", hint=hint)
+        raise InputError("heights", got=f"{shown}, far from all others", wanted="heights", hint=hint)
     return values
 
 

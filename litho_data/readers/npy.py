@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.arrays import Held, array_channel, channels_of
 from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Reader, foreign_parser
 
@@ -27,8 +26,8 @@ def read_channels(path: Path) -> list[Channel]:
     """
     array = load_array(path)
     if array.ndim != 2:
-        raise InputError(f"{path}: shape", got=array.shape, wanted="two dimensions (ny, nx)")
-    return [array_channel("array", array.dtype, array.shape, partial(np.array, array), {})]
+        raise InputError("shape", got=array.shape, wanted="two dimensions (ny, nx)")
+    return [array_channel("array", Held(array.dtype, array.shape, partial(np.array, array)))]
 
 
 def read_archive(path: Path) -> list[Channel]:
@@ -40,21 +39,21 @@ def read_archive(path: Path) -> list[Channel]:
         InputError: damaged file.
     """
     held: dict[str, Held] = {}
-    with foreign_parser(path, "NPZ"), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             with archive.open(member) as stream:
                 shape, _, dtype = _READ_HEADER[np.lib.format.read_magic(stream)](stream)
                 whole = stream.tell() + np.prod(shape, dtype=float) * dtype.itemsize == member.file_size
             if not whole or member.file_size > MOST_BYTES_PER_PACKED_BYTE * member.compress_size:
-                raise InputError(f"{path}: {member.filename}", got=f"{member.file_size} bytes", wanted=shape)
+                raise InputError(member.filename, got=f"{member.file_size} bytes", wanted=shape)
             name = member.filename.removesuffix(".npy")
             if not dtype.hasobject:
                 held[name] = Held(dtype, shape, partial(_member, path, name))
-    return channels_of(path, "NPZ", held)
+    return channels_of(held)
 
 
 def _member(path: Path, name: str) -> Array:
-    with foreign_parser(path, "NPZ"), np.load(path, allow_pickle=False) as archive:
+    with np.load(path, allow_pickle=False) as archive:
         return archive[name]
 
 
@@ -64,11 +63,11 @@ def load_array(path: Path) -> Array:
     Raises:
         InputError: damaged file, pickled objects, or values that are not real numbers.
     """
-    with foreign_parser(path, "NPY"):
+    with foreign_parser("NPY"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     if not isinstance(array, Array) or array.dtype.kind not in "uif":
         raise InputError(
-            f"{path}: type of the values",
+            "type of the values",
             got=getattr(array, "dtype", type(array).__name__),
             wanted="integers or real numbers",
         )

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.readers.reader import DAMAGED
 
 _GZIP = b"\x1f\x8b"
@@ -21,7 +21,7 @@ _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """The file itself, or a temporary file with the unpacked content; messages name the packed file.
+    """The file itself, or a temporary file with the unpacked content.
 
     Raises:
         InputError: damaged, or more than 1 GiB inside.
@@ -38,11 +38,8 @@ def unpacked(path: Path) -> Iterator[Path]:
             unpack(path, content)
         except (OSError, EOFError, zlib.error, struct.error) as error:
             got = str(error) or type(error).__name__
-            raise InputError(f"cannot unpack {path}", got=got, hint=DAMAGED) from error
-        try:
-            yield content
-        except InputError as error:
-            raise InputError(str(error).replace(str(content), str(path))) from error
+            raise InputError("cannot be unpacked", got=got, hint=DAMAGED) from error
+        yield content
 
 
 def _unpack_gzip(path: Path, content: Path) -> None:
@@ -50,7 +47,7 @@ def _unpack_gzip(path: Path, content: Path) -> None:
         while piece := source.read(_PIECE):
             target.write(piece)
             if target.tell() > _MOST_BYTES:
-                raise InputError(f"{path}: content", got="more than 1 GiB", wanted="one scan")
+                raise InputError("content", got="more than 1 GiB", wanted="one scan")
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
@@ -64,7 +61,7 @@ def _unpack_surf(path: Path, content: Path) -> None:
     position, whole = start + 4 + 8 * count, [_SURF, raw[len(_SURF) : start]]
     for plain, packed in sizes:
         if plain > _MOST_BYTES:
-            raise InputError(f"{path}: content", got="more than 1 GiB", wanted="one scan")
+            raise InputError("content", got="more than 1 GiB", wanted="one scan")
         stream = zlib.decompress(raw[position : position + packed])
         if len(sizes) != count or len(stream) != plain:
             raise zlib.error(f"{len(stream)} bytes, wanted {plain}")

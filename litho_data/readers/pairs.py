@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.layout import read_layout
 
 GREY_MAX = 255

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError, about, um_per
 from litho_data.foundation.quantities import HEIGHT_UM
-from litho_data.foundation.units import um_per
+from litho_data.readers.confined import parse
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked
 from litho_data.readers.reader import (
@@ -66,39 +65,40 @@ def read_scan(
             size, a value that looks like an unnamed mark of missing pixels, heights that cannot be, or no
             finite value.
     """
-    with unpacked(require_file(path)) as file:
+    given = require_file(path)
+    with about(str(given)), unpacked(given) as file:
         reader = _settle_format(file, format)
-        chosen = _choose(file, _read_channels(reader, file), channel)
+        chosen = _choose(_read_channels(reader, file), channel)
         values, mask = chosen.load()
-    values = without_missing(file, chosen, values, missing)
-    notes = list(chosen.notes)
-    if defaults and unit is not None and chosen.unit is not None:
-        if um_per(unit) != um_per(chosen.unit):
-            notes.append(f"heights in {chosen.unit}, as the file states, not in {unit}")
-        unit = None
-    if defaults and size_um is not None and chosen.size_um is not None:
-        if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
-            side_y, side_x = chosen.size_um
-            notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
-        size_um = None
-    stated_unit, factor = _settle_unit(file, chosen, values, unit, full_scale_um)
-    height = _to_um(values, factor)
-    finite = height[np.isfinite(height)]
-    ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
-    HEIGHT_UM.require(f"{file}: heights in µm, by unit {stated_unit!r}", ends_um)
-    return Scan(
-        height_um=height,
-        pitch_um=_settle_pitch(file, chosen, size_um, stated_unit),
-        name=file.stem,
-        channel=chosen.name,
-        unit=stated_unit,
-        fast_axis=_settle_fast_axis(file, chosen, fast_axis),
-        mask=mask,
-        header=chosen.header,
-        source=str(path),
-        format=reader.name,
-        notes=(*notes, *filter(None, [extreme_note(values)])),
-    )
+        values = without_missing(chosen, values, missing)
+        notes = list(chosen.notes)
+        if defaults and unit is not None and chosen.unit is not None:
+            if um_per(unit) != um_per(chosen.unit):
+                notes.append(f"heights in {chosen.unit}, as the file states, not in {unit}")
+            unit = None
+        if defaults and size_um is not None and chosen.size_um is not None:
+            if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
+                side_y, side_x = chosen.size_um
+                notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
+            size_um = None
+        stated_unit, factor = _settle_unit(chosen, values, unit, full_scale_um)
+        height = _to_um(values, factor)
+        finite = height[np.isfinite(height)]
+        ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
+        HEIGHT_UM.require(f"heights in µm, by unit {stated_unit!r}", ends_um)
+        return Scan(
+            height_um=height,
+            pitch_um=_settle_pitch(chosen, size_um, stated_unit),
+            name=file.stem,
+            channel=chosen.name,
+            unit=stated_unit,
+            fast_axis=_settle_fast_axis(chosen, fast_axis),
+            mask=mask,
+            header=chosen.header,
+            source=str(path),
+            format=reader.name,
+            notes=(*notes, *filter(None, [extreme_note(values)])),
+        )
 
 
 def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
@@ -108,30 +108,29 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
         InputError: unreadable or of unknown format.
     """
     given = require_file(path)
-    with unpacked(given) as file:
+    with about(str(given)), unpacked(given) as file:
         channels = _read_channels(_settle_format(file, format), file)
-    if file == given:
-        return channels
-    # The unpacked file is gone by the time a channel is loaded.
-    return [replace(one, load=partial(_load_packed, given, format, one.name)) for one in channels]
+    # An unpacked file is gone by the time a channel is loaded.
+    return [replace(one, load=partial(_load, given, format, one.name)) for one in channels]
 
 
-def _load_packed(path: Path, format: str, name: str) -> Loaded:
-    with unpacked(path) as file:
+def _load(path: Path, format: str, name: str) -> Loaded:
+    with about(str(path)), unpacked(path) as file:
         channels = _read_channels(_settle_format(file, format), file)
         return next(channel for channel in channels if channel.name == name).load()
 
 
 def _read_channels(reader: Reader, file: Path) -> list[Channel]:
-    channels = with_unique_names(reader.read_channels(file))
+    run = partial(parse, path=file, kind=reader.name, parsers=reader.parsers)
+    channels = with_unique_names(run(partial(reader.read_channels, file)))
     if not channels:
-        raise InputError(f"{file} ({reader.name}) holds no two-dimensional map of numbers")
+        raise InputError(f"holds no two-dimensional map of numbers ({reader.name})")
     size = file.stat().st_size
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
-            raise InputError(f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED)
-    return [_with_unit_of_name(one) for one in channels]
+            raise InputError(reader.name, got=got, wanted="more", hint=DAMAGED)
+    return [_with_unit_of_name(replace(one, load=partial(run, one.load))) for one in channels]
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:
@@ -143,11 +142,11 @@ def _with_unit_of_name(channel: Channel) -> Channel:
 def _settle_format(file: Path, format: str) -> Reader:
     kind = detect_format(file) if format == "auto" else format
     if kind == PICTURE:
-        raise InputError(f"{file}: format", got=f"a picture ({kind})", wanted="a file with heights")
+        raise InputError("format", got=f"a picture ({kind})", wanted="a file with heights")
     return reader_of(kind)
 
 
-def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
+def _choose(channels: list[Channel], name: str | None) -> Channel:
     listed = ", ".join(channel.describe() for channel in channels) or "none"
     if name is not None:
         for channel in channels:
@@ -155,36 +154,36 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
                 if channel.problem:
                     raise InputError(channel.problem)
                 if not channel.is_height:
-                    raise InputError(f"{file}: channel {name!r} is no height", got=f"unit {channel.unit!r}")
+                    raise InputError(f"channel {name!r} is no height", got=f"unit {channel.unit!r}")
                 return channel
-        raise InputError(f"{file}: channel", got=repr(name), wanted=f"one of {listed}")
+        raise InputError("channel", got=repr(name), wanted=f"one of {listed}")
     heights = [channel for channel in channels if channel.is_height]
     if len(heights) == 1:
         return heights[0]
     problem = "several height channels" if heights else "no height channel"
     hint = "choose one by its name with channel" if heights else ""
-    raise InputError(f"{file} has {problem}", got=listed, wanted="one", hint=hint)
+    raise InputError(problem, got=listed, wanted="one", hint=hint)
 
 
 def _settle_unit(
-    file: Path, channel: Channel, values: Array, unit: str | None, full_scale_um: float | None
+    channel: Channel, values: Array, unit: str | None, full_scale_um: float | None
 ) -> tuple[str, float]:
     """The unit of the file and the factor from its values to µm."""
     if full_scale_um is not None:
         if channel.full_scale is None or channel.unit is not None or unit is not None:
-            raise InputError(f"{file}: full scale", got=full_scale_um, wanted="an integer image and no unit")
+            raise InputError("full scale", got=full_scale_um, wanted="an integer image and no unit")
         if not (np.isfinite(full_scale_um) and full_scale_um > 0):
-            raise InputError(f"{file}: full scale in µm", got=full_scale_um, wanted="a positive number")
+            raise InputError("full scale in µm", got=full_scale_um, wanted="a positive number")
         return f"{full_scale_um:g} µm / {channel.full_scale:g}", full_scale_um / channel.full_scale
     if unit is None and channel.unit is None:
         first = ", ".join(f"{value:g}" for value in np.asarray(values)[0, :3])
         raise InputError(
-            f"{file} does not state the unit of its heights",
+            "it does not state the unit of its heights",
             wanted="unit, for example 'm'",
             hint=f"the first row begins {first}: unit 'm' reads these as metres, 'nm' as nanometres",
         )
     if unit is not None and channel.unit is not None and um_per(unit) != um_per(channel.unit):
-        raise InputError(f"{file}: unit", got=repr(unit), wanted=f"{channel.unit!r} as in the file, or none")
+        raise InputError("unit", got=repr(unit), wanted=f"{channel.unit!r} as in the file, or none")
     stated = channel.unit if channel.unit is not None else str(unit)
     return stated, um_per(stated)
 
@@ -195,13 +194,13 @@ def _to_um(values: Array, factor: float) -> Array:
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
 
 
-def _settle_pitch(file: Path, channel: Channel, size_um: YX | None, unit: str) -> YX | None:
+def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
     stated = channel.size_um or _size_of_extent(channel, unit)
     if size_um is not None:
         if np.shape(size_um) != (2,) or not all(np.isfinite(size) and size > 0 for size in size_um):
-            raise InputError(f"{file}: size_um", got=size_um, wanted="two positive numbers (y, x) in µm")
+            raise InputError("size_um", got=size_um, wanted="two positive numbers (y, x) in µm")
         if stated is not None and not np.allclose(size_um, stated, rtol=_SIZE_TOLERANCE, atol=0):
-            raise InputError(f"{file}: size_um", got=size_um, wanted=f"{stated} as in the file, or none")
+            raise InputError("size_um", got=size_um, wanted=f"{stated} as in the file, or none")
     size = stated if stated is not None else size_um
     return None if size is None else (size[0] / channel.shape[0], size[1] / channel.shape[1])
 
@@ -215,9 +214,9 @@ def _size_of_extent(channel: Channel, unit: str) -> YX | None:
     return likely[0] if len(likely) == 1 else None
 
 
-def _settle_fast_axis(file: Path, channel: Channel, fast_axis: Axis | None) -> Axis | None:
+def _settle_fast_axis(channel: Channel, fast_axis: Axis | None) -> Axis | None:
     if fast_axis not in (None, "x", "y"):
-        raise InputError(f"{file}: fast axis", got=repr(fast_axis), wanted="'x' or 'y'")
+        raise InputError("fast axis", got=repr(fast_axis), wanted="'x' or 'y'")
     if fast_axis is not None and channel.fast_axis is not None and fast_axis != channel.fast_axis:
-        raise InputError(f"{file}: fast axis", got=fast_axis, wanted=f"{channel.fast_axis} as in the file")
+        raise InputError("fast axis", got=fast_axis, wanted=f"{channel.fast_axis} as in the file")
     return channel.fast_axis or fast_axis

@@ -14,9 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
@@ -101,18 +99,22 @@ class Reader:
     Args:
         name: as in ``format = "…"`` of a card and ``--format`` of the commands.
         recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
-        read_channels: the channels of a file, in the order of the file; InputError where it is damaged.
+        read_channels: the channels of a file, in the order of the file. Any exception of it, or of the
+            loading of a channel, becomes one line about the file.
+        parsers: modules of other projects that it uses. It then runs in a child process within limits of
+            time and memory, so it must be importable by name, and its results must be picklable.
     """
 
     name: str
     recognises: Callable[[Path, bytes], bool]
     read_channels: Callable[[Path], list[Channel]]
+    parsers: tuple[str, ...] = ()
 
 
-def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
+def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
     """The channel, or one that says why it cannot be read, so that the other channels stay usable."""
     try:
-        with foreign_parser(path, kind):
+        with foreign_parser("a map"):
             return make()
     except InputError as error:
         return Channel(name, (0, 0), None, None, partial(_refuse, str(error)), problem=str(error))
@@ -139,9 +141,9 @@ def extent_um(y: float, x: float, unit: str | None) -> YX | None:
     return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
-def unknown_content(path: Path, head: bytes) -> InputError:
+def unknown_content(head: bytes) -> InputError:
     """The error for a file that no reader recognises."""
-    return InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
+    return InputError("format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
@@ -171,8 +173,8 @@ def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
 
 
 @contextmanager
-def foreign_parser(path: Path, kind: str) -> Iterator[None]:
-    """Run another project's parser; any exception becomes one InputError about the file.
+def foreign_parser(kind: str) -> Iterator[None]:
+    """Run another project's parser of such a file; any exception becomes one InputError.
 
     On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
     errors, and log to stderr; a caller can do nothing with these.
@@ -184,8 +186,8 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
+        if isinstance(error, MemoryError):
+            reason = "a parser that asked for more memory than such a file can need"
         cut = isinstance(error, _OF_CUT_FILES) or _CUT.search(reason)
-        what = (
-            f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"
-        )
+        what = f"cannot be read as {kind}" if cut else f"unknown kind of {kind}"
         raise InputError(what, got=reason[:_LONGEST_MESSAGE], hint=DAMAGED if cut else "") from error

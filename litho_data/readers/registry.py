@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, sxm, text_matrix, tiff, vendor, wyko
+from litho_data.foundation import InputError, unknown_name
+from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
 # In the order in which they are tried: formats with a signature first, then containers and texts that any
@@ -13,7 +13,6 @@ _READERS = [
     gwy.READER,
     npy.READER,
     npy.ARCHIVE_READER,
-    sxm.READER,
     surfer.READER,
     wyko.READER,
     arrays.NETCDF_READER,
@@ -73,7 +72,7 @@ def detect_format(path: Path) -> str:
     for reader in _READERS:
         if reader.recognises(path, head):
             return reader.name
-    raise unknown_content(path, head)
+    raise unknown_content(head)
 
 
 def require_file(path: str | Path) -> Path:

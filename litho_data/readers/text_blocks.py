@@ -2,14 +2,11 @@
 
 import codecs
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Shape
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, InputError, Shape, is_length, table_beside, um_per
 from litho_data.readers.reader import DAMAGED
 
 # In these expressions, no two neighbouring repetitions match the same characters; otherwise a long line of
@@ -31,7 +28,7 @@ _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
 # Keys are compared by their letters and digits only.
 _NO_LETTER = re.compile(r"[\W_]+")
-WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+WORDS = table_beside(__file__, "words.toml")
 _KEYS: dict[str, list[str]] = WORDS["keys"]
 # The unit of a column or of all numbers, as in "Height [nm]"; before a number it belongs to a length.
 _TITLED = re.compile(
@@ -153,13 +150,13 @@ def read_text(path: Path) -> str:
         text = raw.decode(code)
     except UnicodeDecodeError as error:
         if code != "utf-8-sig":
-            raise InputError(f"cannot read {path} as UTF-16", got=error.reason, hint=DAMAGED) from error
+            raise InputError("cannot be read as UTF-16", got=error.reason, hint=DAMAGED) from error
         text = raw.decode("latin-1")
     text = without_quotes(text.replace("\r\n", "\n").replace("\r", "\n"))
     if strange := _STRANGE.search(text):
         line = text.count("\n", 0, strange.start()) + 1
         got = f"byte 0x{ord(strange[0]):02x}"
-        raise InputError(f"{path} line {line}", got=got, wanted="a text of numbers")
+        raise InputError(f"line {line}", got=got, wanted="a text of numbers")
     return text
 
 

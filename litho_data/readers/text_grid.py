@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
-from litho_data.foundation.units import is_length, um_per
+from litho_data.foundation import YX, Array, InputError, is_length, um_per
 
 # Coordinates are written with few digits: a step may be off by this share of the usual one.
 _UNEVEN = 0.02

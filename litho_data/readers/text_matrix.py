@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, about
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text, without_quotes
 from litho_data.readers.text_grid import Map, map_of_points, without_axes
@@ -31,27 +30,22 @@ def read_channels(path: Path) -> list[Channel]:
     """
     text = read_text(path)
     if text.startswith(_IGOR):
-        raise InputError(
-            f"{path}: format", got="an Igor text wave, whose rows run along x", wanted="an IBW file"
-        )
+        raise InputError("format", got="an Igor text wave, whose rows run along x", wanted="an IBW file")
     blocks = blocks_of(text)
     if not blocks:
-        raise InputError(f"{path} holds no numbers", wanted="one line per row of the height map")
-    refuse_cut_end(path, text)
+        raise InputError("holds no numbers", wanted="one line per row of the height map")
+    refuse_cut_end(text)
     names = [one.name or ("height" if len(blocks) == 1 else f"block {k}") for k, one in enumerate(blocks, 1)]
     if len(blocks) == 1:
-        return [_channel(path, names[0], blocks[0])]
-    return [
-        one_by_one(path, "text", name, partial(_channel, path, name, block))
-        for name, block in zip(names, blocks, strict=True)
-    ]
+        return [_channel(names[0], blocks[0])]
+    pairs = zip(names, blocks, strict=True)
+    return [one_by_one(name, partial(_channel, name, block)) for name, block in pairs]
 
 
-def _channel(path: Path, name: str, block: Block) -> Channel:
-    table = numbers_of(path, block)
-    with about(str(path)):
-        found, factor = _map_of(block, table), block.factor
-        block.require_pixels(found.values.shape)
+def _channel(name: str, block: Block) -> Channel:
+    table = numbers_of(block)
+    found, factor = _map_of(block, table), block.factor
+    block.require_pixels(found.values.shape)
     values = found.values
     for number in block.missing:
         values = np.where(np.isclose(values, number, rtol=1e-6, atol=0), np.nan, values)
@@ -121,11 +115,11 @@ def _recognises(path: Path, head: bytes) -> bool:
 def _refuse_points(path: Path) -> None:
     """A table of points is a map only if they fill a grid, unless the caller says that it is a matrix."""
     for block in blocks_of(read_text(path)):
-        table = numbers_of(path, block)
+        table = numbers_of(block)
         columns = table.values.shape[1]
         if _may_be_points(table.values.shape) and map_of_points(table.values, block.words) is None:
             raise InputError(
-                f"{path} holds {'a profile' if columns == 2 else 'a point cloud or profiles'}",
+                f"holds {'a profile' if columns == 2 else 'a point cloud or profiles'}",
                 got=f"{columns} numbers in a row, the first {' '.join(cells_of(block.rows[0]))}",
                 wanted="a height map, or the points of a whole regular grid",
             )

@@ -2,14 +2,12 @@
 
 import io
 import re
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.readers.text_blocks import Block
 
 _EXPONENT = re.compile(r"[eE][+-]?\d+$")
@@ -31,7 +29,7 @@ class Table:
     corner: str | None = None
 
 
-def numbers_of(path: Path, block: Block) -> Table:
+def numbers_of(block: Block) -> Table:
     """The numbers of a block; ``nan`` and words are NaN, an empty cell is the word "".
 
     A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
@@ -41,26 +39,23 @@ def numbers_of(path: Path, block: Block) -> Table:
             cut off; the message names the line and shows the first rows.
     """
     try:
-        return _numbers(path, "\n".join(block.rows), block.first_line)
+        return _numbers("\n".join(block.rows), block.first_line)
     except InputError as error:
         rows = [row.strip() for row in block.rows if row.strip()][:_SHOWN_ROWS]
         shown = " | ".join(repr(row[:_SHOWN_CHARACTERS]) for row in rows)
         raise InputError(str(error), hint=f"the first rows are {shown}") from error
 
 
-def _numbers(path: Path, text: str, first_line: int) -> Table:
-    text, separator = _plain(path, text, first_line)
-    try:
+def _numbers(text: str, first_line: int) -> Table:
+    text, separator = _plain(text, first_line)
+    with suppress(ValueError):
         values = np.loadtxt(io.StringIO(text), delimiter=separator, dtype=float, comments=None, ndmin=2)
-        table = Table(values, {})
-    except ValueError:
-        table = _cell_by_cell(path, text, separator, first_line)
-    if np.isinf(table.values).any():
-        _refuse_overflow(path, text, separator, first_line)
-    return table
+        if not np.isinf(values).any():
+            return Table(values, {})
+    return _cell_by_cell(text, separator, first_line)
 
 
-def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
+def _plain(text: str, first_line: int) -> tuple[str, str | None]:
     """The text with decimal points, and the separator of its cells; None for blanks.
 
     Commas separate cells only if nothing else does; otherwise they are decimal commas, and the file has no
@@ -84,13 +79,13 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
         tight = _AROUND_COMMA.sub(",", text)
         if not _OTHER_SEPARATOR.search(tight):
             separator = ","
-            _refuse_decimal_commas(path, tight, first_line)
+            _refuse_decimal_commas(tight, first_line)
         elif "." in tight or tight != text:
             for line, row in enumerate(tight.split("\n"), start=first_line):
                 if "," in row and _OTHER_SEPARATOR.search(row.strip()):
                     got = repr(row.strip()[:_SHOWN_CHARACTERS])
                     wanted = "cells with one separator, and no marks of thousands"
-                    raise InputError(f"{path} line {line}", got=got, wanted=wanted)
+                    raise InputError(f"line {line}", got=got, wanted=wanted)
         else:
             parts = _AT_COMMA.findall(text)
             if (
@@ -99,20 +94,20 @@ def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
                 and _WHOLE.search(text)
             ):
                 raise InputError(
-                    f"{path} line {first_line}",
+                    f"line {first_line}",
                     got="commas before three digits",
                     wanted="no marks of thousands",
                 )
             text = text.replace(",", ".")
     if "\t" in text and all(_THOUSANDS.fullmatch(cell.strip()) for cell in re.split(r"[\t\n]", text) if cell):
         got = repr(text[:_SHOWN_CHARACTERS])
-        raise InputError(f"{path} line {first_line}", got=got, wanted="no marks of thousands")
+        raise InputError(f"line {first_line}", got=got, wanted="no marks of thousands")
     if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):
         separator = "\t"
     return text, separator
 
 
-def _refuse_decimal_commas(path: Path, text: str, first_line: int) -> None:
+def _refuse_decimal_commas(text: str, first_line: int) -> None:
     """Refuse rows like ``0,9000,0,3100``: every second cell, and no other, has the same number of digits."""
     if "." in text:
         return
@@ -120,14 +115,12 @@ def _refuse_decimal_commas(path: Path, text: str, first_line: int) -> None:
     every, other = ({len(cell) for row in rows for cell in row[start::2]} for start in (1, 0))
     if len(every) == 1 and every.isdisjoint(other) and all(len(row) % 2 == 0 for row in rows):
         got = repr(",".join(rows[0])[:_SHOWN_CHARACTERS])
-        raise InputError(
-            f"{path} line {first_line}", got=got, wanted="decimal commas or commas between cells"
-        )
+        raise InputError(f"line {first_line}", got=got, wanted="decimal commas or commas between cells")
 
 
-def _cell_by_cell(path: Path, text: str, separator: str | None, first_line: int) -> Table:
+def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:
     rows = [
-        (line, [cell.strip() for cell in (row.split(separator) if separator else row.split())])
+        (line, [cell.strip() for cell in row.split(separator)])
         for line, row in enumerate(text.split("\n"), start=first_line)
         if row.strip()
     ]
@@ -136,27 +129,37 @@ def _cell_by_cell(path: Path, text: str, separator: str | None, first_line: int)
         rows[0][1].insert(0, "")  # the corner between a column and a row of coordinates
     width, width_line = len(rows[0][1]), rows[0][0]
     words: dict[str, int] = {}
-    corner = None if _is_number(rows[0][1][0]) else rows[0][1][0]
+    corner = rows[0][1][0] if _number(rows[0][1][0]) is None else None
     values = np.full((len(rows), width), np.nan)
     for number, (line, cells) in enumerate(rows):
+        found = [_number(cell) for cell in cells]
         if len(cells) != width:
-            _refuse_ragged(path, line, len(cells), f"{width} values as in line {width_line}", cells)
-        for column, cell in enumerate(cells):
-            if _is_number(cell):
-                values[number, column] = float(cell)
+            for cell, value in zip(cells, found, strict=True):
+                if value is None and cell:
+                    raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number")
+            wanted = f"{width} values as in line {width_line}"
+            raise InputError(f"line {line}", got=f"{len(cells)} values", wanted=wanted, hint=_TRUNCATED)
+        for column, (cell, value) in enumerate(zip(cells, found, strict=True)):
+            if value is not None:
+                values[number, column] = value
+                # A number like 1e400 reads as an infinity that was not written.
+                if np.isinf(value) and "inf" not in cell.lower():
+                    raise InputError(f"line {line}", got=repr(cell[:24]), wanted="a number below 1e308")
             elif number or column:
                 words.setdefault(cell, line)
     return Table(values, words, corner)
 
 
-def _refuse_ragged(path: Path, line: int, count: int, wanted: str, cells: list[str]) -> NoReturn:
-    for cell in cells:
-        if not _is_number(cell) and cell:
-            raise InputError(f"{path} line {line}", got=repr(cell[:24]), wanted="a number")
-    raise InputError(f"{path} line {line}", got=f"{count} values", wanted=wanted, hint=_TRUNCATED)
+def _number(cell: str) -> float | None:
+    """The number in a cell; None for a word."""
+    try:
+        # Only Python takes 1_000 for a number.
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None
 
 
-def refuse_cut_end(path: Path, text: str) -> None:
+def refuse_cut_end(text: str) -> None:
     """Refuse a copy that was cut off inside the last number: 5.4e-007 cut to 5.4 would read as 5.4 m.
 
     Raises:
@@ -171,22 +174,5 @@ def refuse_cut_end(path: Path, text: str) -> None:
     if before is not None and (last is None or len(last[0]) < len(before[0])):
         line = text.count("\n") + 1
         wanted = f"a number spelt like {last_row[-2]!r}"
-        what = f"{path} line {line} ends inside a number"
+        what = f"line {line} ends inside a number"
         raise InputError(what, got=repr(last_row[-1]), wanted=wanted, hint=_TRUNCATED)
-
-
-def _refuse_overflow(path: Path, text: str, separator: str | None, first_line: int) -> None:
-    """Refuse numbers too large to hold, such as 1e400, which read as an infinity that was not written."""
-    for line, row in enumerate(text.split("\n"), start=first_line):
-        for cell in row.split(separator):
-            if "inf" not in cell.lower() and _is_number(cell) and np.isinf(float(cell)):
-                raise InputError(f"{path} line {line}", got=repr(cell[:24]), wanted="a number below 1e308")
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    # Only Python takes 1_000 for a number.
-    return "_" not in cell

@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
-from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.confined import confined
+from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
 from litho_data.readers.text_blocks import header_of
 
@@ -49,12 +46,12 @@ def read_channels(path: Path) -> list[Channel]:
     """
     with open_tiff(path) as file:
         pages: list[tuple[int, Any]] = [
-            (k, page) for k, page in enumerate(file.pages) if not _is_reduced(page)
+            (k, page) for k, page in enumerate(file.pages) if not getattr(page, "is_reduced", False)
         ]
         imagej, ome = file.imagej_metadata or {}, file.ome_metadata or ""
         pitches = _ome_pitches_um(ome, len(pages))
         return [
-            one_by_one(path, "TIFF", f"page {index}", partial(_channel, path, index, page, imagej, pitch))
+            one_by_one(f"page {index}", partial(_channel, path, index, page, imagej, pitch))
             for (index, page), pitch in zip(pages, pitches, strict=True)
         ]
 
@@ -64,11 +61,11 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
     """A TIFF file, open; any error of a damaged one becomes an InputError."""
     import tifffile
 
-    with foreign_parser(path, "TIFF"), tifffile.TiffFile(path) as file:
+    with foreign_parser("TIFF"), tifffile.TiffFile(path) as file:
         yield file
 
 
-def require_upright(path: Path, page: Any) -> None:
+def require_upright(page: Any) -> None:
     """Refuse a page marked as turned or mirrored, because programs differ in how they show it.
 
     Raises:
@@ -76,9 +73,7 @@ def require_upright(path: Path, page: Any) -> None:
     """
     stated = page.tags.valueof(_ORIENTATION, _UPRIGHT)
     if stated != _UPRIGHT:
-        raise InputError(
-            f"{path}: Orientation of the page", got=int(stated), wanted="1, the first row on top"
-        )
+        raise InputError("Orientation of the page", got=int(stated), wanted="1, the first row on top")
 
 
 def maker_of(path: Path) -> str:
@@ -95,19 +90,18 @@ def maker_of(path: Path) -> str:
 
 def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: YX | None) -> Channel:
     samples = page.samplesperpixel
-    what = f"{path} page {index}"
     if page.ndim not in (2, 3) or (page.ndim == 3 and page.shape[-1] != samples):
-        raise InputError(f"{what}: shape", got=page.shape, wanted="a two-dimensional image")
+        raise InputError("shape", got=page.shape, wanted="a two-dimensional image")
     shape = (int(page.shape[0]), int(page.shape[1]))
-    require_upright(path, page)
+    require_upright(page)
     dtype = np.dtype(page.dtype)
     if dtype.kind not in "uif":
-        raise InputError(f"{what}: type of the values", got=dtype, wanted="integers or real numbers")
+        raise InputError("type of the values", got=dtype, wanted="integers or real numbers")
     if page.photometric.name in ("PALETTE", "MINISWHITE") and dtype.kind in "ui":
-        raise InputError(f"{what}: values", got=page.photometric.name.lower(), wanted="larger is higher")
+        raise InputError("values", got=page.photometric.name.lower(), wanted="larger is higher")
     if hidden := [tag.code for tag in page.tags if _may_hold_heights(tag, shape)]:
-        raise InputError(f"{what}: heights may be in private tag {hidden[0]} of an unknown maker")
-    scale, offset, unit, missing = _calibration(what, page, imagej)
+        raise InputError(f"heights may be in private tag {hidden[0]} of an unknown maker")
+    scale, offset, unit, missing = _calibration(page, imagej)
     return Channel(
         name=f"page {index}",
         shape=shape,
@@ -120,10 +114,6 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: 
     )
 
 
-def _is_reduced(page: Any) -> bool:
-    return bool(page.is_reduced)
-
-
 def _may_hold_heights(tag: Any, shape: Shape) -> bool:
     import tifffile
 
@@ -131,9 +121,7 @@ def _may_hold_heights(tag: Any, shape: Shape) -> bool:
     return unknown and tag.valuebytecount >= shape[0] * shape[1]
 
 
-def _calibration(
-    what: str, page: Any, imagej: dict[str, Any]
-) -> tuple[float, float, str | None, float | None]:
+def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str | None, float | None]:
     """Scale, offset, unit and no-data value of a page.
 
     Raises:
@@ -146,7 +134,7 @@ def _calibration(
     if "c0" in imagej or "c1" in imagej or int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE:
         if int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE or "c2" in imagej:
             stated = ", ".join(f"{key} = {imagej[key]}" for key in ("cf", "c0", "c1", "c2") if key in imagej)
-            raise InputError(f"{what}: calibration by ImageJ", got=stated, wanted="a straight line, cf = 0")
+            raise InputError("calibration by ImageJ", got=stated, wanted="a straight line, cf = 0")
         scale, offset = float(imagej.get("c1", 1.0)), float(imagej.get("c0", 0.0))
     if str(imagej.get("vunit", "")).strip().lower() not in _WITHOUT_MEANING:
         unit = _plain_unit(imagej["vunit"])
@@ -207,7 +195,7 @@ def _size_um(page: Any, imagej: dict[str, Any], shape: Shape) -> YX | None:
 
 def _load(path: Path, index: int, scale: float, offset: float, missing: float | None) -> Loaded:
     with open_tiff(path) as file:
-        pixels = single_sample(path, file.pages[index].asarray())
+        pixels = single_sample(file.pages[index].asarray())
     if (scale, offset, missing) == (1, 0, None):
         return pixels, None
     values = pixels.astype(float)
@@ -219,7 +207,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
     return np.where(bad, np.nan, values * scale + offset), None
 
 
-def single_sample(path: Path, pixels: Array) -> Array:
+def single_sample(pixels: Array) -> Array:
     """(ny, nx) from (ny, nx), or from opaque (ny, nx, 1 to 4) with identical colours.
 
     Raises:
@@ -227,15 +215,13 @@ def single_sample(path: Path, pixels: Array) -> Array:
     """
     if pixels.ndim == 3 and 1 <= pixels.shape[2] <= 4:
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != pixels[..., -1].max()).any():
-            raise InputError(f"{path} has transparent pixels", wanted="an image without them")
+            raise InputError("image", got="transparent pixels", wanted="an image without them")
         colours = pixels[..., : (pixels.shape[2] - 1) | 1]
         if (colours == colours[..., :1]).all():
             return pixels[..., 0]
-        raise InputError(
-            f"{path} is a colour image", wanted="a grey image", hint="the colours of a pixel differ"
-        )
+        raise InputError("image", got="colours that differ within a pixel", wanted="a grey image")
     if pixels.ndim != 2:
-        raise InputError(f"{path}: shape", got=pixels.shape, wanted="a two-dimensional image")
+        raise InputError("shape", got=pixels.shape, wanted="a two-dimensional image")
     return pixels
 
 
@@ -244,6 +230,4 @@ def is_tiff(head: bytes) -> bool:
     return head.startswith(_MAGIC)
 
 
-READER = Reader(
-    "tiff", lambda path, head: is_tiff(head), confined(read_channels, ("tifffile", "imagecodecs"))
-)
+READER = Reader("tiff", lambda path, head: is_tiff(head), read_channels, ("tifffile", "imagecodecs"))

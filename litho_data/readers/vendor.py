@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
-from litho_data.readers.confined import confined
+from litho_data.foundation import Array, Facts, InputError, table_beside
 from litho_data.readers.reader import (
     DAMAGED,
     Channel,
@@ -28,38 +26,11 @@ from litho_data.readers.tiff import is_tiff, maker_of
 from litho_data.scan import Axis
 
 _HEAD_BYTES = 512
-IMPORTS = ("SurfaceTopography.IO", "igor2.binarywave")
-# How files of formats with a signature start. Formats without a signature are left out, because any bytes of
-# the right length would pass as a map.
-_STARTS: dict[str, tuple[bytes, ...]] = {
-    "al3d": (b"AliconaImaging\0\r\n",),
-    "bcr": (b"fileformat = bcr", "fileformat = bcr".encode("utf-16-le"), "fileformat = bcr".encode("utf-16")),
-    "di": (b"\\*File list", b"?*File list"),
-    "ezd": (b"[DataSet]",),
-    "frt": (b"FRTM_GLIDERV",),
-    "mdt": (b"\x01\xb0\x93\xff",),
-    "metropro": (b"\x88\x1b\x03o", b"\x88\x1b\x03p", b"\x88\x1b\x03q"),
-    "mi": (b"fileType",),
-    "mnt": (b"\xd0\xcf\x11\xe0",),
-    "oir": (b"OLYMPUSRAWFORMAT",),
-    "opd": (b"\x01\0Directory",),
-    "opdx": (b"VCA DATA",),
-    "os3d": (b"OmniSurf3D",),
-    "sdf": (b"aISO-1.0", b"bISO-1.0"),
-    "sur": (b"DIGITAL SURF",),
-    "tmd": (b"Binary TrueMap Data File v2.0",),
-    "vk": (b"VK3_", b"VK4_", b"VK6", b"VK7"),
-    "wsxm": (b"WSxM file copyright",),
-    "zmg": (b"Zeta-Instruments",),
-    "zon": (b"KPK0", b"KPK1"),
+_FORMATS = table_beside(__file__, "formats.toml")
+_STARTS = {
+    kind: tuple(one.encode("latin-1") for one in starts) for kind, starts in _FORMATS["starts"].items()
 }
-_ZIP, _IN_ZIP = b"PK\x03\x04", ("x3p", "mitutoyo", "nmm", "plux", "poir", "qep")
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-# Formats of which the tests read no file.
-_UNTESTED = {
-    "datx", "frt", "lext", "mdt", "metropro", "mitutoyo", "nmm", "oir", "opdx", "os3d", "plux", "poir", "qep",
-    "vk", "zmg", "zon",
-}  # fmt: skip
+_ZIP, _HDF5 = b"PK\x03\x04", b"\x89HDF\r\n\x1a\n"
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
 # Digital Surf's kinds of studiables that are not one surface (series, layers, pictures, curves, spectra), and
@@ -80,11 +51,9 @@ def read_channels(path: Path) -> list[Channel]:
     """
     kind = _recognise(path)
     header = _vendor_header(path, kind)
-    with foreign_parser(path, kind), _open(path, kind) as reader:
+    with _open(path, kind) as reader:
         maps = [info for info in reader.channels if info.dim == 2 and min(info.nb_grid_pts) > 1]
-        channels = [
-            one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
-        ]
+        channels = [one_by_one(str(one.name), partial(_channel, path, kind, one, header)) for one in maps]
     names = _layer_names(path, kind)
     if len(names) == len(channels) == 1 and names[0]:
         channels = [replace(channels[0], name=names[0])]
@@ -97,7 +66,7 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
     elif head.startswith(_ZIP):
-        signed = _IN_ZIP
+        signed = tuple(_FORMATS["kinds"]["in_zip"])
     elif head.startswith(_HDF5):
         signed = ("datx",)
     elif _PLU.match(head):
@@ -131,14 +100,14 @@ def _recognise(path: Path) -> str:
                 _require_whole_igor_file(path, head)
             found = int.from_bytes(head[_SURFACE_KIND_AT : _SURFACE_KIND_AT + 2], "little")
             if kind == "sur" and found in _NO_SURFACES:
-                raise InputError(f"{path} (sur): kind of studiable", got=found, wanted="one surface (2)")
-            with foreign_parser(path, kind), _open(path, kind):
+                raise InputError("kind of studiable", got=found, wanted="one surface (2)")
+            with foreign_parser(kind), _open(path, kind):
                 return kind
         except InputError as error:
             refusals.append(error)
     if len(refusals) == 1:
         raise refusals[0]
-    raise unknown_content(path, head)
+    raise unknown_content(head)
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
@@ -149,7 +118,7 @@ def _require_whole_igor_file(path: Path, head: bytes) -> None:
     stated = sum(struct.unpack_from(f"{order}{_IGOR_5_SIZES}", head.ljust(64, b"\0"), 4)) + 64
     if stated > path.stat().st_size:
         raise InputError(
-            f"cannot read {path} as ibw",
+            "cannot be read as ibw",
             got=f"{path.stat().st_size} bytes",
             wanted=f"the {stated} of its header",
             hint=DAMAGED,
@@ -179,7 +148,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
         notes=(f"read by SurfaceTopography as {kind}, which no test here covers",)
-        if kind in _UNTESTED
+        if kind in _FORMATS["kinds"]["untested"]
         else (),
     )
 
@@ -188,13 +157,13 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
     # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
-    with foreign_parser(path, kind), _open(path, kind) as reader:
+    with _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
         values: Array = np.ma.filled(np.ma.asarray(heights, dtype=float), np.nan)
     return np.ascontiguousarray(values.T), None
 
 
-def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(content: Facts, prefix: str = "") -> Iterator[tuple[str, str]]:
     for key, value in content.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
@@ -235,8 +204,7 @@ def _layer_names(path: Path, kind: str) -> list[str]:
 def _igor_wave(path: Path) -> dict[str, Any]:
     from igor2 import binarywave
 
-    with foreign_parser(path, "ibw"):
-        return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
+    return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
 
 
 def _igor_note(path: Path) -> dict[str, str]:
@@ -268,4 +236,9 @@ def _nanoscope_header(path: Path) -> dict[str, str]:
     return header
 
 
-READER = Reader("vendor", lambda path, head: bool(_kinds(path, head)), confined(read_channels, IMPORTS))
+READER = Reader(
+    "vendor",
+    lambda path, head: bool(_kinds(path, head)),
+    read_channels,
+    ("SurfaceTopography.IO", "igor2.binarywave"),
+)

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import InputError, Shape
 from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 from litho_data.readers.text_blocks import NUMBER, Block, number, read_text
 from litho_data.readers.text_numbers import numbers_of
@@ -39,29 +38,27 @@ def read_channels(path: Path) -> list[Channel]:
             while end < len(lines) and NUMBER.match(lines[end].strip().replace(_BAD, "0")):
                 end += 1
             block = Block({}, [], position + 1, lines[position:end])
-            channels.append(_channel(path, cells[0], block, (ny, nx), says, in_nm))
+            channels.append(_channel(cells[0], block, (ny, nx), says, in_nm))
             position = end
         elif len(cells) > 1:
             says[cells[0]] = cells[-1]
     return channels
 
 
-def _channel(path: Path, name: str, block: Block, shape: Shape, says: dict[str, str], in_nm: bool) -> Channel:
+def _channel(name: str, block: Block, shape: Shape, says: dict[str, str], in_nm: bool) -> Channel:
     if not block.rows:
-        raise InputError(f"{path}: {name}", got="no numbers", hint=DAMAGED)
-    table = numbers_of(path, block)
+        raise InputError(name, got="no numbers", hint=DAMAGED)
+    table = numbers_of(block)
     values, by_columns = table.values, table.values.shape == shape[::-1]
     if not by_columns and values.shape != shape:
         got = f"{values.shape[0]} lines of {values.shape[1]}"
-        raise InputError(f"{path}: {name}", got=got, wanted=f"{shape[1]} of {shape[0]}", hint=DAMAGED)
+        raise InputError(name, got=got, wanted=f"{shape[1]} of {shape[0]}", hint=DAMAGED)
     values = values.T[::-1] if by_columns else values
     wavelength_nm, pitch_mm = number(says.get("Wavelength", "")), number(says.get("Pixel_size", ""))
     multiplier, aspect = (number(says.get(key, "1")) or 1.0 for key in ("Mult", "Aspect"))
     scale = 1.0 if in_nm else wavelength_nm / multiplier
     if name in _HEIGHTS and not np.isfinite(scale):
-        raise InputError(
-            f"{path} (Wyko ASCII): Wavelength", got=says.get("Wavelength"), wanted="a number of nm"
-        )
+        raise InputError("Wavelength", got=says.get("Wavelength"), wanted="a number of nm")
     pitch_um = abs(pitch_mm) * 1e3
     return Channel(
         name=name,

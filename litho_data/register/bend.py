@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.register.features import Correspondence, match_features
 from litho_data.register.geometry import (
     apply_transform,

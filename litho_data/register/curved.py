@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.geometry import apply_transform, lattice, warped_grid
 from litho_data.register.pyramid import FineFit, match_blur, project_to_model, reduced_levels

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.register.flows import Model
 from litho_data.register.geometry import apply_transform, corners, nearest, overlap_of, warped_grid
 from litho_data.register.pyramid import FineFit, refine_pyramid

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.geometry import corners
 from litho_data.register.refine import BORDER_PX, Refinement, corner_motion_px, interior_of, solve_gram
 from litho_data.register.topography import pearson, smooth_measured

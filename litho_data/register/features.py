@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform
 from litho_data.register.topography import fill_gaps, predicted_topography, smooth_measured

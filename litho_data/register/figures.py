@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.coarse import CoarseFit
 from litho_data.register.evidence import BlockShifts, bootstrap_corner_sd_px, match_blocks_of_field
 from litho_data.register.geometry import apply_transform, centre, linear_part, overlap_of
@@ -16,7 +16,8 @@ from litho_data.register.topography import quadratic_basis
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
     """Figures of the fit: how the warp was found, and how well it explains matches and heights."""
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
-    figures: dict[str, Any] = {
+    overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
+    return {
         "model": fine.refinement.model if bend is None else bend.kind,
         "method": coarse.method,
         "dihedral": coarse.orientation,
@@ -28,13 +29,8 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
         "matches": len(points.inlier) if points else 0,
         "inlier_ratio": float(points.inlier.mean()) if points else float("nan"),
         "reprojection_px": points.reprojection_px(warp, bend) if points else float("nan"),
-        "coverage": float("nan"),
+        "coverage": points.coverage(overlap) if points else float("nan"),
     }
-    if points:
-        overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
-        figures["coverage"] = points.coverage(overlap)
-    figures["reprojection_nm"] = figures["reprojection_px"] * pitch_um * 1e3
-    return figures
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
 # Each rung uses the first so many generators, so the ladder is nested by construction.

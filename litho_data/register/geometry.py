@@ -7,7 +7,7 @@ pixel centres 0, 1, 2 …; the micrometre frame of the same image has those cent
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 

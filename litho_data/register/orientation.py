@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.geometry import ORIENTATIONS, orient
 
 SEARCH_SIZE_PX = 128

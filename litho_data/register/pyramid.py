@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.flows import LADDER, Model
 from litho_data.register.geometry import apply_transform, centre, corners, linear_part, warped_grid

@@ -25,7 +25,6 @@ class RegistrationQuality:
     matches: int
     inlier_ratio: float
     reprojection_px: float
-    reprojection_nm: float
     coverage: float
     overlap: float
     defect_share: float

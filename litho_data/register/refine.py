@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
 from litho_data.register.geometry import apply_transform, corners, warped_grid

@@ -4,8 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, InputError, Shape
 from litho_data.register.bend import Bend
 from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps

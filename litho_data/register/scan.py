@@ -6,8 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, InputError, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
 from litho_data.register.curved import refine_curved

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 
 
 def predicted_topography(layout_level: Array, blur_px: float) -> Array:

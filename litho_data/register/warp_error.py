@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.register.flows import BENT_COUNT, LADDER, flows, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram

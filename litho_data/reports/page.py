@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation import Facts, atomic_file, table_beside
 from litho_data.foundation.run_facts import RunFacts, run_facts
-from litho_data.reports.paper import wanted, write_figures, write_table
+from litho_data.reports.paper import wanted_format, write_figures
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
 
 if TYPE_CHECKING:
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.figure import Figure
 
-    Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
+    Table = pd.DataFrame | Facts | Iterable[Facts | BaseModel]
 
 # Column of a table to its title and meaning; the CSV keeps the key.
 Words = Mapping[str, Sequence[str]]
 
-_SPELT = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+_SPELT = table_beside(__file__, "words.toml")
 # Columns that name a model get its colour.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
 # Columns whose values are keys, which are spelt out like the names of columns.
@@ -61,7 +61,7 @@ class Page:
         known = tomllib.loads(words.read_text(encoding="utf-8")) if isinstance(words, Path) else words
         self._words: Words = known or {}
         self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
-        self._tables: list[tuple[str, pd.DataFrame, list[str], int]] = []
+        self._tables: dict[str, pd.DataFrame] = {}
         self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
@@ -125,12 +125,12 @@ class Page:
         ]
         meanings = [(column["name"], column["meaning"]) for column in shown if column["meaning"]]
         self._add("table", caption=caption, csv=csv_name, columns=shown, rows=rows, meanings=meanings)
-        self._tables.append((csv_name, frame, [str(column["name"]) for column in shown], digits))
+        self._tables[csv_name] = frame
 
     def figure(self, figure: Figure, caption: str) -> None:
         """A matplotlib figure of :func:`new_figure`."""
         self._add("figure", caption=caption, address=svg_address(figure))
-        if wanted().figures:
+        if wanted_format():
             self._figures.append(figure)
 
     def gallery(
@@ -146,12 +146,11 @@ class Page:
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page, its tables and the copies for a paper into ``folder``; returns the page's path."""
+        """Write the page, its tables and the figures for a paper into ``folder``; returns the page's path."""
         target = Path(folder)
-        for csv_name, frame, names, digits in self._tables:
+        for csv_name, frame in self._tables.items():
             with atomic_file(target / csv_name) as temporary:
                 frame.to_csv(temporary, index=False)
-            write_table(frame, names, target / csv_name, digits)
         write_figures(self._figures, target)
         run = self._run or RunFacts(**run_facts())
         commit = run.commit + (" with changes" if run.dirty else "")
@@ -189,7 +188,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
     return pd.DataFrame([dict(_cells(row, digits)) for row in table])
 
 
-def _cells(row: Mapping[str, Any] | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _cells(row: Facts | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Columns and values of a row, including those of the records in it."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):

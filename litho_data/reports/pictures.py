@@ -11,44 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, table_beside
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LIGHT = {
-    "paper": "#ffffff",
-    "ink": "#1c2430",
-    "soft": "#56616f",
-    "line": "#dfe4ea",
-    "band": "#f4f6f9",
-    "accent": "#0b6aa2",
-}
-DARK = {
-    "paper": "#13171d",
-    "ink": "#e6e9ee",
-    "soft": "#a7b1be",
-    "line": "#343d49",
-    "band": "#1d232b",
-    "accent": "#6cb8ea",
-}
+_OWN = table_beside(__file__, "colours.toml")
+LIGHT, DARK = _OWN["light"], _OWN["dark"]
 # Colours of a figure that change with the screen's.
 _OF_SCREEN = ("ink", "paper", "soft", "accent")
-# One colour per model on every page; its contrast is 3:1 on light and dark paper (tests/test_report.py).
-_MODEL_COLOURS = {
-    "identity": "#868d98",
-    "none": "#868d98",
-    "affine": "#a87400",
-    "affine-mtf": "#b56b4c",
-    "blur-table": "#7d8a1d",
-    "linear": "#0e8f86",
-    "physics": "#c8502f",
-    "pbl": "#2f7fd0",
-    "fno": "#9a63c9",
-    "features": "#3a9142",
-    "random-features": "#cc4f8f",
-    "corrected": "#3a9142",
-}
 _FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87400")
 _PICTURE_DPI = 110
 _COLOURS = 255
@@ -59,7 +30,7 @@ _GAP = 255  # the last entry of the palette, transparent
 
 def model_colour(name: str) -> str:
     """The colour of a model on every page: fixed for the project's models, else derived from the name."""
-    known = _MODEL_COLOURS.get(name)
+    known = _OWN["models"].get(name)
     return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import scipy.fft
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Record
 
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 

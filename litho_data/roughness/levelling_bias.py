@@ -10,8 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.fft
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape
 
 Correlation = Callable[[Array, Array], Array]
 

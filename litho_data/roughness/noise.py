@@ -4,7 +4,7 @@ from math import comb
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 

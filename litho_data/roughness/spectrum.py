@@ -5,8 +5,7 @@ from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, InputError, Shape, require_known
 from litho_data.scan import Axis
 
 

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.foundation.results import Record
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis

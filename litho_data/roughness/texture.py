@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import digamma, gammaincc, ndtri, polygamma
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.roughness.spectrum import hann
 
 FEWEST_LINES = 64

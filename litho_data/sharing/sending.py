@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 from io import BytesIO
 from typing import Any
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import Facts, InputError
 from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 
@@ -27,8 +27,8 @@ class Known:
     objects that it made last.
     """
 
-    make: Callable[[], Mapping[str, Any]]
-    objects: Mapping[str, Any]
+    make: Callable[[], Facts]
+    objects: Facts
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Away:
     folder: str
     command: str
     plugins: Sequence[str]
-    software: Mapping[str, Any] | None
+    software: Facts | None
 
     def __call__(self, job: bytes) -> bytes:
         load_plugins(self.plugins)
@@ -57,8 +57,8 @@ class Away:
 
 
 @lru_cache(maxsize=1)
-def _made(make: bytes) -> Mapping[str, Any]:
-    made: Mapping[str, Any] = pickle.loads(make)()
+def _made(make: bytes) -> Facts:
+    made: Facts = pickle.loads(make)()
     return made
 
 
@@ -69,7 +69,7 @@ def sent(content: Any, names: Mapping[int, str]) -> bytes:
     return stream.getvalue()
 
 
-def received(content: bytes, objects: Mapping[str, Any]) -> Any:
+def received(content: bytes, objects: Facts) -> Any:
     """Replace the names in a sent job by these objects."""
     return _Receiver(BytesIO(content), objects).load()
 
@@ -84,7 +84,7 @@ class _Sender(pickle.Pickler):
 
 
 class _Receiver(pickle.Unpickler):
-    def __init__(self, stream: BytesIO, objects: Mapping[str, Any]):
+    def __init__(self, stream: BytesIO, objects: Facts):
         super().__init__(stream)
         self._objects = objects
 
@@ -92,7 +92,7 @@ class _Receiver(pickle.Unpickler):
         return self._objects[name]
 
 
-def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
+def _require_alike(wanted: Facts, folder: str) -> None:
     """Refuse a Dask worker whose results would differ; checked with each job, as workers come and go."""
     from distributed import get_worker
 

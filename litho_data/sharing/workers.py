@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import NamedTuple, TypeVar
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.foundation.plugins import plugin_files
 from litho_data.foundation.run_facts import run_facts, software_record
 from litho_data.sharing.sending import Away, Known, received, sent

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 
 if TYPE_CHECKING:
     import pandas as pd

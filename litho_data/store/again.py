@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 from litho_data.store.read import PrintedScan, Store, open_store
 
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, damaged, require_known
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, InputError, damaged, require_known
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
     HEIGHT_UM,
@@ -79,7 +78,7 @@ def missing_files(path: Path) -> Iterator[str]:
                 yield from (folder + chunk for chunk in _chunks(document) if folder + chunk not in names)
 
 
-def _may_be_left_out(name: str, document: Mapping[str, Any]) -> bool:
+def _may_be_left_out(name: str, document: Facts) -> bool:
     """Whether a copy by xarray, which has no groups, may lack the chunk of this array.
 
     It writes no chunk that holds only fill values, such as order 0 of a single scan, or a column that no scan
@@ -117,7 +116,7 @@ def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
         yield from ((name, archive.read(name)) for name in wanted)
 
 
-def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
+def _chunks(document: Facts) -> Iterator[str]:
     """Names of the files of an array, below its folder."""
     sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
     encoding = document["chunk_key_encoding"]
@@ -127,11 +126,6 @@ def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
     for place in itertools.product(*map(range, counts)):
         numbers = [*(["c"] if with_c else []), *map(str, place)]
         yield between.join(numbers) or "0"
-
-
-def _by_xarray(attributes: Mapping[str, Any]) -> bool:
-    """Whether xarray wrote this array of booleans: it stores them as small integers and says so."""
-    return attributes.get("dtype") == "bool"
 
 
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
@@ -166,8 +160,10 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        as_integers = variable.dtype == "bool" and _by_xarray(array.attrs)
-        if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
+        # xarray stores booleans as small integers, and says so.
+        as_integers = variable.dtype == array.attrs.get("dtype") == "bool"
+        known = as_integers or str(array.dtype) in (variable.dtype, variable.wider)
+        if array.shape != wanted or not known:
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
         dims: Any = array.metadata.to_dict()["dimension_names"]
@@ -196,7 +192,7 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """``scan`` (the ids), ``print``, ``order`` and the optional columns, None where a number is not stated.
+    """``scan`` (the ids), ``print``, ``order`` and all optional columns; None and "" where nothing is stated.
 
     Raises:
         InputError: no scan, an id that repeats or holds a path, columns of other lengths, or an impossible
@@ -214,17 +210,17 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     order = values_of(root, "order")
     ORDER.require(f"order of {path}", order)
     columns["order"] = [int(value) for value in order]
-    for name in OPTIONAL_COLUMNS:
+    for name, limits in OPTIONAL_COLUMNS.items():
+        columns[name] = [None] * len(ids)
         if has_child(root, name):
-            stated = [None if value != value else value for value in values_of(root, name).tolist()]
-            OPTIONAL_COLUMNS[name].require(
-                f"{name} of {path}", [value for value in stated if value is not None]
-            )
-            columns[name] = [None if value is None else float(value) for value in stated]
+            values = values_of(root, name).tolist()
+            # NaN is not equal to itself.
+            limits.require(f"{name} of {path}", [value for value in values if value == value])
+            columns[name] = [float(value) if value == value else None for value in values]
     for name in TEXT_COLUMNS:
-        if has_child(root, name):
-            columns[name] = [str(value) for value in values_of(root, name)]
-    for word in columns.get("surround", []):
+        texts = values_of(root, name) if has_child(root, name) else [""] * len(ids)
+        columns[name] = [str(text) for text in texts]
+    for word in columns["surround"]:
         require_known(f"surround of {path}", word, ("", *get_args(Surround)))
     for name, values in columns.items():
         if len(values) != len(ids):
@@ -270,7 +266,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
         )
 
 
-def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
+def require_manifest(manifest: Facts, path: Path) -> None:
     """Refuse a manifest that lacks what its readers need; a manifest with only a table is not from a build.
 
     Raises:

@@ -8,7 +8,7 @@ import hashlib
 from collections.abc import Sequence
 from typing import Protocol
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation import InputError
 
 
 class HasPrint(Protocol):

@@ -18,9 +18,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, damaged
-from litho_data.foundation.files import atomic_file, publish, unfinished
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, InputError, atomic_file, damaged
+from litho_data.foundation.files import publish, unfinished
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group
@@ -33,11 +32,11 @@ if TYPE_CHECKING:
 class Piece:
     """One finished scan: its arrays by name, and a record of plain data with ``id``, ``key``, ``steps``, …"""
 
-    record: Mapping[str, Any]
+    record: Facts
     arrays: Mapping[str, Array]
 
 
-def outputs_of(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def outputs_of(record: Facts) -> list[Facts]:
     """The outputs of the steps of a scan's record: name, hash, shape, …"""
     return [output for step in record["steps"] for output in step["outputs"]]
 
@@ -79,7 +78,7 @@ class PartialStore:
         root.require_group("scans")
         return root
 
-    def finished(self, root: zarr.Group, keys: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    def finished(self, root: zarr.Group, keys: Facts) -> dict[str, dict[str, Any]]:
         """Records of the scans that need not be computed again.
 
         Args:
@@ -128,7 +127,7 @@ class PartialStore:
         """Remove the unfinished store."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _intact(self, root: zarr.Group, record: Mapping[str, Any]) -> bool:
+    def _intact(self, root: zarr.Group, record: Facts) -> bool:
         hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
         try:
             arrays = self.samples(record["id"])

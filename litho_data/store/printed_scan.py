@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, array_sha256, record_sha256
 from litho_data.register.bend import Bend
 
 
@@ -18,7 +17,7 @@ class PrintedScan:
 
     Args:
         id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
-        mask_level: layout levels, uint8 (ny, nx).
+        mask_level: layout levels, uint8 (beyond 256 levels uint16), (ny, nx).
         height_um: float32 (ny, nx), µm, NaN where not measured.
         valid: bool (ny, nx), measured and inside the scan.
         pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
@@ -51,7 +50,7 @@ class PrintedScan:
     level_height_um: float
     levels: int
     scan_to_layout: Array
-    write: Mapping[str, Any] | None = None
+    write: Facts | None = None
     field_x_um: float | None = None
     field_y_um: float | None = None
     dose: float | None = None

@@ -6,13 +6,12 @@ import html
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from litho_data.foundation.errors import damaged, unknown_name
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, Facts, damaged, unknown_name
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,
@@ -125,13 +124,13 @@ class Store:
             scan_to_layout=self.sample("scan_to_layout", row),
             write=self.write,
             seen_by=self.instrument,
-            **{name: self._column(name, row) for name in OPTIONAL_COLUMNS},
+            **{name: self._columns[name][row] for name in OPTIONAL_COLUMNS},
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
             height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,
             groups=self._groups(scan_id),
-            instrument=self._word("instrument", row),
-            surround=self._word("surround", row) or str((self.write or {}).get("surround", "unknown")),
+            instrument=self._columns["instrument"][row],
+            surround=self._columns["surround"][row] or str((self.write or {}).get("surround", "unknown")),
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
@@ -161,7 +160,8 @@ class Store:
             InputError: a stored chunk that does not decode.
         """
         what = f"{name} of scan {self.ids[row]} in {self.path}"
-        values = decoded(self._arrays[name], row, what).astype(VARIABLES[name].dtype, copy=False)
+        values = decoded(self._arrays[name], row, what)
+        values = values.astype(VARIABLES[name].stored_as(values), copy=False)
         if name == "scan_to_layout":
             return values
         ny, nx = self.shapes[row]
@@ -243,16 +243,13 @@ class Store:
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
 
     def _identity(self, row: int) -> dict[str, Any]:
-        identity: dict[str, Any] = {
+        stated = {name: self._columns[name][row] for name in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS)}
+        identity = {
             "id": self.ids[row],
             "print": self._print_ids[row],
             "order": self._columns["order"][row],
+            **{name: value for name, value in stated.items() if value not in (None, "")},
         }
-        for name in OPTIONAL_COLUMNS:
-            value = self._column(name, row)
-            if value is not None:
-                identity[name] = value
-        identity |= {name: word for name in TEXT_COLUMNS if (word := self._word(name, row))}
         samples = {v.name: self.sample(v.name, row) for v in SAMPLE_VARIABLES}
         require_possible(samples, self.levels, f"scan {self.ids[row]} of {self.path}")
         hashes = {v.name: v.sample_sha256(samples[v.name]) for v in SAMPLE_VARIABLES}
@@ -279,13 +276,7 @@ class Store:
             value = float(self.quality["tip_radius_um"].iloc[row])
         return None if math.isnan(value) else value
 
-    def _word(self, name: str, row: int) -> str:
-        return self._columns[name][row] if name in self._columns else ""
 
-    def _column(self, name: str, row: int) -> float | None:
-        return self._columns[name][row] if name in self._columns else None
-
-
-def _read_facts(row: Mapping[str, Any]) -> dict[str, Any]:
+def _read_facts(row: Facts) -> dict[str, Any]:
     facts: dict[str, Any] = json.loads(row["read"] or "{}")
     return facts

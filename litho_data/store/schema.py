@@ -1,13 +1,12 @@
-"""The dataset store at a glance: arrays, dimensions, types, units, and the hash of a dataset."""
+"""The dataset store at a glance: arrays (``variables.toml``), columns, and the hash of a dataset."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, Facts, array_sha256, record_sha256, table_beside
 from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
@@ -18,22 +17,30 @@ WRITE = "write_"
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name."""
+    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name.
+
+    ``wider``: the type where ``dtype`` does not hold all values.
+    """
 
     name: str
     dims: tuple[str, ...]
     dtype: str
     unit: str
     long_name: str
+    wider: str = ""
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
         """The dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
+    def stored_as(self, sample: Array) -> str:
+        """The type in the store of values like these."""
+        return self.wider if str(sample.dtype) == self.wider else self.dtype
+
     def sample_sha256(self, sample: Array) -> str:
         """Hash of one scan's slice in its true shape, so padding and chunking do not matter."""
-        return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
+        return array_sha256(np.asarray(sample, dtype=self.stored_as(sample)), self.unit, self.sample_dims)
 
 
 class DatasetId(Record):
@@ -43,39 +50,13 @@ class DatasetId(Record):
     sha256: str
 
 
-SAMPLE_VARIABLES = (
-    Variable("mask_level", ("scan", "y", "x"), "uint8", "1", "layout level sent to the printer"),
-    Variable("height_um", ("scan", "y", "x"), "float32", "um", "levelled, registered height, layout grid"),
-    Variable("valid", ("scan", "y", "x"), "bool", "1", "measured and inside the scan"),
-    Variable("scan_to_layout", ("scan", "row", "column"), "float64", "1",
-             "maps (x_um, y_um, 1) of the scan frame to the layout frame"),
-)  # fmt: skip
-SIGMA = Variable("height_sigma_um", ("scan", "y", "x"), "float32", "um",
-                 "standard uncertainty of height_um, its offset aside")  # fmt: skip
-"""Missing in stores made before 0.1.0 or from 8-bit pairs, and not part of the dataset's hash."""
+SAMPLE_VARIABLES, (SIGMA,), SCAN_VARIABLES = (
+    tuple(Variable(name, tuple(dims.split()), *rest) for name, (dims, *rest) in table.items())
+    for table in table_beside(__file__, "variables.toml").values()
+)
+"""The arrays over all scans, their uncertainty, and those of single scans; see ``variables.toml``."""
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layouts' grid."""
-SCAN_VARIABLES = (
-    Variable("micrograph", ("y", "x"), "uint16", "1", "grey values as read from the raw file, scan frame"),
-    Variable("edge_distance_um", ("y", "x"), "float32", "um",
-             "signed distance from the nearest edge of the film, positive on it, capped; scan frame"),
-    Variable("raw_height_um", ("y", "x"), "float32", "um", "height as read from the raw file, scan frame"),
-    Variable("levelled_height_um", ("y", "x"), "float32", "um", "height after levelling, scan frame"),
-    Variable("removed_um", ("y", "x"), "float32", "um", "surface that levelling removed, scan frame"),
-    Variable(
-        "layout_in_scan", ("y", "x"), "float32", "1", "layout level under each scan pixel; only where needed"
-    ),
-    Variable("bend_um", ("axis", "term"), "float64", "um",
-             "displacement along x, y per u² - 1/3, uv, v² - 1/3 (and, if it creeps, P3(u), P3(v), … P6(v)) "
-             "of the scan frame; only of a bent scan"),
-    Variable("defect", ("layout_y", "layout_x"), "bool", "1",
-             "shows something else than the print, layout grid; not valid there; only where there is any"),
-    Variable("tip_certain", ("y", "x"), "bool", "1",
-             "touched by the tip for certain, scan frame; only where a tip is given; elsewhere not valid"),
-    Variable("calibration", ("scale", "figure"), "float64", "1",
-             "scales along y, x and of heights: factor, its standard uncertainty; only if calibrated"),
-    Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
-)  # fmt: skip
 # The array as a whole has no unit; hashes use 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
@@ -89,15 +70,15 @@ OPTIONAL_COLUMNS = {
     "pixel_size": Range(1e-3, 1e3),
 }
 """Numbers per scan from the card's table with their ranges; coordinates, NaN where a row has none."""
-Instrument = Literal["afm", "sem"]
-"""What heights are: measured by an atomic force microscope (``afm``), or a film's height times its coverage
-of a pixel, from the edges in an electron micrograph (``sem``)."""
+Instrument = Literal["afm", "profilometer", "confocal", "sem"]
+"""What heights are: measured by a probe (``afm``, ``profilometer``), by light (``confocal``), or a film's
+height times its coverage of a pixel, from the edges in an electron micrograph (``sem``)."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
 """Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
 
 
-def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | None) -> dict[str, Any]:
+def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:
     """Facts about all scans, as part of the dataset's hash.
 
     Args:
@@ -108,7 +89,7 @@ def dataset_facts(geometry: Any, instrument: str, write: Mapping[str, Any] | Non
     return {**facts, **kind, **({"write": dict(write)} if write else {})}
 
 
-def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
+def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
     """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
 
     Args:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Facts, Shape
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     MIXED_UNITS,
@@ -49,7 +49,8 @@ def write_scan_group(
     for variable in SCAN_VARIABLES:
         if variable.name in arrays:
             array = arrays[variable.name]
-            _create(group, variable.name, array.shape, chunks=array.shape)[...] = array
+            described = {"dtype": variable.dtype, "chunks": array.shape}
+            _create(group, variable.name, array.shape, **described)[...] = array
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
@@ -62,7 +63,7 @@ def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
 
 def write_samples(
     root: zarr.Group,
-    scans: Sequence[Mapping[str, Any]],
+    scans: Sequence[Facts],
     load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
@@ -78,10 +79,11 @@ def write_samples(
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
     field_shape = {"y": ny, "x": nx, "row": 3, "column": 3}
     with_sigma = all(SIGMA.name in scan["arrays"] for scan in scans)
-    arrays = {}
+    arrays, first = {}, load(scans[0]["id"])
     for variable in LAYOUT_VARIABLES if with_sigma else SAMPLE_VARIABLES:
         sample = tuple(field_shape[dim] for dim in variable.sample_dims)
-        arrays[variable.name] = _create(root, variable.name, (len(scans), *sample), chunks=(1, *sample))
+        described = {"dtype": variable.stored_as(first[variable.name]), "chunks": (1, *sample)}
+        arrays[variable.name] = _create(root, variable.name, (len(scans), *sample), **described)
     arrays["height_um"].attrs["ancillary_variables"] = f"valid {SIGMA.name}" if with_sigma else "valid"
     for row, scan in enumerate(scans):
         loaded = load(scan["id"])
@@ -132,7 +134,7 @@ def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str)
 
 
 def write_numbers(
-    group: zarr.Group, name: str, values: Array, dim: str, attributes: Mapping[str, Any] | None = None
+    group: zarr.Group, name: str, values: Array, dim: str, attributes: Facts | None = None
 ) -> None:
     """A one-dimensional array of numbers."""
     _write(group, name, values, dim, values.dtype, attributes=dict(attributes or {}))
@@ -178,7 +180,6 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
         group,
         name,
         shape=shape,
-        dtype=variable.dtype,
         fill_value=np.nan if variable.dtype.startswith("float") else 0,
         dimension_names=names,
         attributes=attributes,
@@ -190,6 +191,6 @@ def _padded(name: str, sample: Array, shape: Shape) -> Array:
     """A sample in the upper left corner of the common shape; ``PADDING`` elsewhere."""
     if sample.shape == shape:
         return sample
-    whole = np.full(shape, PADDING[name], dtype=VARIABLES[name].dtype)
+    whole = np.full(shape, PADDING[name], dtype=sample.dtype)
     whole[: sample.shape[0], : sample.shape[1]] = sample
     return whole

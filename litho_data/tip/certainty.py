@@ -8,8 +8,7 @@ those whose highest possible height is set by such a valley (Villarrubia 1997, s
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.register.topography import smooth_measured
 from litho_data.tip.curvature import (
     DISC_RADII_PX,

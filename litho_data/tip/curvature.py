@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.roughness.noise import fine_differences, robust_sd
 
 # Radii in pixels; each adds pixels to the disc before it.

@@ -6,8 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.scan import Scan

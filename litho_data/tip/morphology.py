@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 
 
 class Eroded(NamedTuple):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 
 # Sanner et al. 2022: artefacts set in where peaks reach half of the tip's curvature.
 _SHARE = 0.5

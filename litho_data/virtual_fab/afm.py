@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.ndimage
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.virtual_fab.geometry import ScanFrame
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import Job

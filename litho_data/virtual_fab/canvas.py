@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, Shape
 
 GUARD_PX = 96
 

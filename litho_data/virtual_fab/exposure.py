@@ -4,7 +4,7 @@ import numpy as np
 import scipy.ndimage
 import scipy.signal
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import (
     GUARD_PX,

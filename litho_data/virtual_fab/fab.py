@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.virtual_fab.afm import scan_surface
 from litho_data.virtual_fab.canvas import cut_layout
 from litho_data.virtual_fab.geometry import ScanFrame, place_scan, sample_surface

@@ -6,6 +6,7 @@ its source, and etching shifts the distance from an edge.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,9 +16,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, zoom
 
 from litho_data.commands.progress import progress
+from litho_data.foundation import Array, InputError, Shape, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.kinds import Array, Shape
 from litho_data.foundation.results import Result
 from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
@@ -25,6 +25,8 @@ from litho_data.virtual_fab.canvas import blur
 
 # Pixels per layout pixel of the image in which edges are located, and of the micrograph.
 _FINER, _AROUND = 4, 64
+# Rim of a random layout without film, px.
+_RIM_PX = 12
 _RESIST = 30.0
 # Points along each side of the source. With 9, edges are displaced by 1.5 nm; with 21, by 0.5 nm.
 _SOURCE_POINTS = 21
@@ -81,6 +83,11 @@ class FilmPrinter:
     wavelength_um: float = 0.365
     na: float = 0.5
     source: float = 0.6
+
+    @property
+    def resolved_um(self) -> float:
+        """Width of what the beam or lens resolves."""
+        return self.spot_um if self.process == "e-beam" else 0.25 * self.wavelength_um / self.na
 
 
 FILM_PRINTERS = {
@@ -178,10 +185,14 @@ def simulate_films(
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)
+        # A field lies alone on bare ground; copies of it in the periodic canvas are out of reach.
+        longest_um = max(8 * printer.resolved_um, 3 * knobs.backscatter_um * (knobs.backscatter > 0))
+        bare_px = math.ceil(longest_um / 2 / printer.pitch_um)
+        inner = (slice(_FINER * bare_px, -_FINER * bare_px),) * 2
         for number in progress(range(count), "printing films"):
             rng, name = np.random.default_rng([seed, number]), f"F{number:02}"
             level = random_film((size_px, size_px), printer, rng, finer=number % 3)
-            distance = edge_distance_px(level, printer, knobs)
+            distance = edge_distance_px(np.pad(level, bare_px), printer, knobs)[inner]
             write_layout(raw, name, level)
             np.save(hidden / f"{name}.npy", distance.astype(np.float32))
             cv2.imwrite(str(raw / "scans" / f"{name}.png"), micrograph(distance, knobs, rng))
@@ -195,13 +206,15 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """A random layout, uint8 (ny, nx) of 0 and 1, of features that the process resolves; a third are fine."""
-    lens_um = 0.25 * printer.wavelength_um / printer.na
-    smallest_um = printer.spot_um if printer.process == "e-beam" else lens_um
-    cutoff_per_um = 1 / (smallest_um * (7 - finer))
-    return random_layout(
-        shape, levels=2, cutoff_per_um=cutoff_per_um, pitch_um=printer.pitch_um, seed=rng, passband="round"
+    """A random layout with a bare rim, uint8 (ny, nx) of 0 and 1, of features that the process resolves; a
+    third are fine.
+    """
+    cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
+    inner = tuple(length - 2 * _RIM_PX for length in shape)
+    level = random_layout(
+        inner, levels=2, cutoff_per_um=cutoff_per_um, pitch_um=printer.pitch_um, seed=rng, passband="round"
     )
+    return np.pad(level, _RIM_PX)
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.ndimage
 
-from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.foundation import YX, Array, Shape
 from litho_data.virtual_fab.canvas import GUARD_PX
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.settings import Microscope

@@ -4,15 +4,13 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
-from litho_data.cards.card import Use, load_card
+from litho_data.cards.card import load_card
 from litho_data.cards.listing import files_by_id
 from litho_data.cards.tables import read_table
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import YX, Shape
+from litho_data.foundation import YX, InputError, Shape
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job
@@ -145,7 +143,7 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     if not files:
         raise InputError(f"layouts of card {path}", got="none", wanted=card.layout.files)
     ids = sorted(files, key=lambda one: files[one][0])
-    rank = {scan_id: int(table.get(scan_id, {}).get("order", place)) for place, scan_id in enumerate(ids)}
+    rank = {scan_id: table.get(scan_id, {}).get("order", place) for place, scan_id in enumerate(ids)}
     spread = max(1, len(ids) - 1)
     jobs: list[Job] = []
     printed: dict[tuple[str, bytes], tuple[int, float]] = {}
@@ -163,11 +161,11 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
                 index=first + index,
                 print_index=print_index,
                 order=order,
-                **{name: float(row[name]) for name in SCANNING if name in row},
-                dose=float(row.get("dose", 1.0)),
-                field_um=(float(row.get("field_y_um", 0.0)), float(row.get("field_x_um", 0.0))),
+                **{name: row[name] for name in SCANNING if name in row},
+                dose=row.get("dose", 1.0),
+                field_um=(row.get("field_y_um", 0.0), row.get("field_x_um", 0.0)),
                 write_field_um=card.write.field_um if card.write else None,
-                use=cast(Use, row.get("use", "dataset")),
+                use=row.get("use", "dataset"),
                 grating_um=card.grating.period_um if card.grating else None,
             )
         )

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation import InputError, table_beside, unknown_name
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
@@ -121,8 +119,5 @@ class KnobBoard:
         return np.random.default_rng([self._seed[name], zlib.crc32(name.encode()), stream])
 
 
-KNOBS: dict[str, Knob] = {
-    one["name"]: Knob(**one)
-    for one in tomllib.loads(Path(__file__).with_name("knobs.toml").read_text(encoding="utf-8"))["knob"]
-}
+KNOBS: dict[str, Knob] = {one["name"]: Knob(**one) for one in table_beside(__file__, "knobs.toml")["knob"]}
 """All knobs by name, in the order of the listing; the table is ``knobs.toml``."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.cards.card import Use
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.virtual_fab.canvas import Canvas, frame_layout, gaussian_transfer
 from litho_data.virtual_fab.exposure import accumulate_dose
 from litho_data.virtual_fab.geometry import ScanFrame

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from litho_data.foundation.kinds import Array, Shape
+from litho_data.foundation import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
 # The spectrum of the measured prints' fine residual: a band of line-shaped features 0.45 µm apart across the

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.ndimage
 
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array
 from litho_data.virtual_fab.canvas import Canvas, blur
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.random_curves import perlin_curve, smooth_map

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from litho_data.foundation.errors import require_known
-from litho_data.foundation.kinds import Shape
+from litho_data.foundation import Shape, require_known, table_beside
 
 
 @dataclass(frozen=True)
@@ -119,27 +118,17 @@ class Preset:
     noise: Noise = Noise()
 
 
+_MACHINES = {"printer": Printer, "microscope": Microscope, "noise": Noise}
+
+
+def _value(key: str, value: Any) -> Any:
+    made = _MACHINES[key](**value) if key in _MACHINES else value
+    return tuple(made) if isinstance(made, list) else made
+
+
 PRESETS = {
-    "plain": Preset(count=12, size_px=256),
-    "demo": Preset(
-        count=12,
-        size_px=192,
-        knobs=("elliptical-psf=0.55", "tilt-bow=10"),
-    ),
-    "measured-like": Preset(
-        count=24,
-        size_px=512,
-        knobs=("slope-thinning-x=0.4", "scan-line-stripes=8", "tilt-bow=20", "min-to-zero-datum=1"),
-    ),
-    # Differs in everything that a program could have learnt by heart.
-    "second-printer": Preset(
-        count=5,
-        size_px=(128, 192),
-        fields_per_print=1,
-        printer=Printer(pitch_um=0.2, level_height_um=0.02, levels=64, spot_sigma_um=0.5, base_um=0.05),
-        microscope=Microscope(margin_px=40.0, rotation_deg=0.3, shift_um=0.5, files="gsf"),
-        noise=Noise(roughness_nm=9.0, line_nm=2.0, pixel_nm=1.5, datum_nm=10.0),
-    ),
+    name: Preset(**{key: _value(key, value) for key, value in one.items()})
+    for name, one in table_beside(__file__, "presets.toml").items()
 }
 
 

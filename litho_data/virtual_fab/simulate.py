@@ -10,10 +10,8 @@ import numpy as np
 
 from litho_data.cards.card import load_card
 from litho_data.commands.progress import progress
+from litho_data.foundation import InputError, Shape, array_sha256, record_sha256, require_known
 from litho_data.foundation.begun import whole_folder
-from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.kinds import Shape
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
@@ -42,7 +40,6 @@ def simulate(
     write_field_um: float | None = None,
     references: bool = False,
     jobs: Sequence[Job] | None = None,
-    metadata: str = "full",
     name: str = "virtual-fab",
     plan_of: str = "",
     print_pattern: str = PRINT_PATTERN,
@@ -67,19 +64,11 @@ def simulate(
         jobs: your own layouts instead of random ones; the arguments about random layouts are then unused.
         plan_of: hash of the dataset that the layouts were planned from, ``print_pattern``: which print an id
             belongs to, for the card.
-        metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
 
     Raises:
         InputError: an unknown knob, a strength out of range, an impossible plan, or a folder that holds a run
             with other settings or something else.
     """
-    require_known("metadata", metadata, ("full", "files-only"))
-    if references and metadata != "full":
-        raise InputError(
-            "references",
-            got="metadata files-only",
-            wanted="full, because only the table identifies references",
-        )
     if references and jobs is not None:
         raise InputError(
             "references", got="own layouts", wanted="references among the layouts, by their use in the table"
@@ -108,7 +97,7 @@ def simulate(
         "microscope": asdict(fab.microscope),
         "noise": asdict(fab.noise),
         "knobs": [KnobTruth.of(setting, seed).model_dump() for setting in fab.knobs.settings],
-        "settings": {**asked, "metadata": metadata},
+        "settings": asked,
     }
     with whole_folder(out, "raw", "truth", record=f"truth/{Truth.FILE_NAME}", facts=facts) as folder:
         raw, hidden = folder / "raw", folder / "truth"
@@ -124,14 +113,14 @@ def simulate(
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
-        tables: dict[str, dict[str, Any]] = {}
-        if metadata == "full":
-            _write_table(raw, rows)
-            in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
-            tables["ids"] = {"print": print_pattern if in_prints else None, "table": TABLE_NAME}
-            tables["write"] = {"slow_axis": "y", "field_um": job.write_field_um}
-            if job.grating_um is not None:
-                tables["grating"] = {"period_um": job.grating_um}
+        _write_table(raw, rows)
+        in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
+        tables: dict[str, dict[str, Any]] = {
+            "ids": {"print": print_pattern if in_prints else None, "table": TABLE_NAME},
+            "write": {"slow_axis": "y", "field_um": job.write_field_um},
+        }
+        if job.grating_um is not None:
+            tables["grating"] = {"period_um": job.grating_um}
         if plan_of:
             tables["plan"] = {"dataset_sha256": plan_of}
         write_card(

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.kinds import Array
+from litho_data.foundation import Array, InputError
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked

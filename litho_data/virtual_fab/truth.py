@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from litho_data.foundation.kinds import YX, Array
+from litho_data.foundation import YX, Array
 from litho_data.foundation.results import Record, Result
 from litho_data.level import level_polynomial
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
@@ -64,7 +64,7 @@ class ScanTruth(Record):
 class Truth(Result):
     """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid. ``settings``: further settings of the run; None in older files.
+    Both are heights in µm on the layout grid. ``settings``: further settings of the run.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -75,7 +75,7 @@ class Truth(Result):
     microscope: Microscope
     noise: Noise
     knobs: list[KnobTruth]
-    settings: dict[str, Any] | None = None
+    settings: dict[str, Any]
     scans: list[ScanTruth]
 
 

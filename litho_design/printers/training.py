@@ -104,30 +104,22 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
     return np.pad(trained / trained.sum(), (0, max(0, levels - trained.size)))
 
 
-def own_error_um(
-    card: Mapping[str, Any], height_um: Tensor, pitch_um: float, relief_um: float
-) -> Tensor | float:
-    """Expected rms error of a model on a print (ny, nx), µm, from its errors on the prints in its card.
+def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
+    """Expected rms error of a model, µm, on the print of a relief of this standard deviation, µm.
 
-    It grows with the square of the rms slope, because models err at edges, or with the standard deviation of
-    the wanted relief, if these exceed those of the card's prints. The scatter of the prints' gains is added.
-    Errors are taken as normal, so the mean absolute error is sqrt(2 / pi) of the rms error. 0 if the card has
-    no prints.
+    It is the model's error on the prints in its card, larger for a relief that is higher than those prints,
+    plus the scatter of the prints' gains. Errors are taken as normal, so the mean absolute error is
+    sqrt(2 / pi) of the rms error. 0 if the card has no prints.
     """
-    import torch
-
     prints = card.get("baseline") or []
     if not prints:
         return 0.0
-    error_nm, relief_nm, steepness, gain = (
-        np.array([one[name] for one in prints], float)
-        for name in ("error_nm", "relief_nm", "steepness", "gain")
+    error_nm, relief_nm, gain = (
+        np.array([one[name] for one in prints], float) for name in ("error_nm", "relief_nm", "gain")
     )
-    slopes = torch.stack(torch.gradient(height_um, spacing=pitch_um)).square().sum(0).mean().sqrt()
-    least = max(1.0, 1e3 * relief_um / float(relief_nm.mean()))
-    times = ((slopes / steepness.mean()) ** 2).clamp(min=least)
+    times = max(1.0, 1e3 * relief_um / float(relief_nm.mean()))
     error_um = math.sqrt(math.pi / 2) * 1e-3 * float(error_nm.mean()) * times
-    return (error_um**2 + (float(gain.std()) * relief_um) ** 2).sqrt()
+    return math.hypot(error_um, float(gain.std()) * relief_um)
 
 
 def _distance(share: np.ndarray, trained: np.ndarray) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from litho_data.commands.settings import changed, setting
-from litho_design.optimisation.settings import DesignSettings, SearchSettings
+from litho_design.optimisation.settings import DesignSettings, EnsemblePenalty, SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -18,6 +18,8 @@ class ReliefSettings(DesignSettings):
         SearchSettings(start="inverse", iterations=60, learning_rate=0.3, polish_rounds=150),
         "Search",
     )
+    # The expected error already contains the disagreement of the models.
+    ensemble: EnsemblePenalty = setting(EnsemblePenalty(weight=0), "Several models")
     height_um: float = setting(
         0.6,
         "Height of a drawing, or of the brightest value of a picture",

@@ -104,8 +104,12 @@ class ReliefTask(Task):
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
         """The expected rms error, µm, from the error of the model's print and the model's own error."""
         rms_um = self.loss(seen)
-        own_um = own_error_um(printer.card, seen, self.settings.layout.pitch_um, float(self.asked.std()))
+        own_um = own_error_um(printer.card, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
+
+    def over_models(self, losses: Tensor) -> Tensor:
+        """The expected rms error, µm, if each model is as likely to be right as the others."""
+        return losses.square().mean().sqrt()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
         """Errors, nm."""
@@ -126,7 +130,7 @@ class ReliefTask(Task):
         """Levels whose uniform print has the wanted height at the best zero, or the best affine levels."""
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
-        return min((*starts, self.cells.average(self._best_affine)), key=self._worst_loss)
+        return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
         """The layout with the wanted heights unchanged, and the best affine layout."""
@@ -147,13 +151,13 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Levels (size, size) of the gain * height + zero whose worst error over the printers is lowest."""
+        """Levels (size, size) of the gain * height + zero whose loss over the printers is lowest."""
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
         unit = top * layout.level_height_um / (heights[-1] - heights[0])
 
         def error(given: Sequence[float]) -> float:
-            return self._worst_loss(self.cells.average(self._affine(*given)))
+            return self._expected(self.cells.average(self._affine(*given)))
 
         coarse = [(g * unit, zero * (top - g * unit * span)) for g in _AFFINE_GAINS for zero in _AFFINE_ZEROS]
         gain, zero = min(coarse, key=error)
@@ -170,10 +174,11 @@ class ReliefTask(Task):
         return self.cells(self.cells.average(level).round().clamp(0, layout.levels - 1))
 
     @torch.no_grad()
-    def _worst_loss(self, levels: Tensor) -> float:
-        """Largest loss of real levels (*cells), rounded, over the printers of the search."""
+    def _expected(self, levels: Tensor) -> float:
+        """Loss of real levels (*cells), rounded, over the printers of the search."""
         whole = self.cells(levels.round())[None, None].float()
-        return max(float(self.loss_by(printer, printer(whole)[0, 0])[0]) for printer in self.printers)
+        losses = torch.stack([self.loss_by(one, one(whole)[0, 0])[0] for one in self.printers])
+        return float(self.over_models(losses))
 
     def thick_score(self, height_um: Tensor) -> None:
         """None: heights do not depend on the light."""

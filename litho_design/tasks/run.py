@@ -126,7 +126,7 @@ def _make(
 
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
-    """The candidate whose largest loss over the available models is smallest.
+    """The candidate with the smallest loss over all available models.
 
     Args:
         searched: levels of the search on the pixels (size, size).
@@ -145,7 +145,11 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
             model: {"loss": float(task.loss_by(models[model], one)[0]), **task.window_figures(one)}
             for model, one in seen.items()
         }
-    returned = min(figures, key=lambda name: max(one["loss"] for one in figures[name].values()))
+
+    def over_models(name: str) -> float:
+        return float(task.over_models(torch.tensor([one["loss"] for one in figures[name].values()])))
+
+    returned = min(figures, key=over_models)
     known = next(iter(figures[SEARCHED].values()))
     figure = next((name for name in (*task.headline, *known) if name in known), "loss")
     return candidates[returned], Width(

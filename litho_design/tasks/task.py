@@ -152,6 +152,10 @@ class Task:
         phase = printed_phase(nominal, self.settings.optics).to(self.printer.device)
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
+    def over_models(self, losses: Tensor) -> Tensor:
+        """One loss from those through several models (models,): the largest."""
+        return losses.max()
+
     def check_printer(self, printer: Printer) -> None:
         """Refuse a printer that cannot print this task's layouts."""
 
@@ -262,7 +266,7 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models it is their worst loss plus their disagreement; with samples of the process window
+        With several models it is ``over_models`` plus their disagreement; with samples of the process window
         it is the risk over them. The penalty on rare levels and steps is added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
@@ -273,8 +277,7 @@ class Task:
             seen = [bench(height) for height in drawn]
             found = [self.loss_by(one, image) for one, image in zip(self.printers, seen, strict=True)]
             parts = parts or found[0][1]
-            of_models = torch.stack([loss for loss, _ in found])
-            losses.append(of_models.max())
+            losses.append(self.over_models(torch.stack([loss for loss, _ in found])))
         loss = losses[0]
         if len(losses) > 1:
             together = torch.stack(losses)

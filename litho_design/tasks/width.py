@@ -18,7 +18,7 @@ class Width(Record):
         searched_with: how many of the models the search used.
         figures: figures by candidate and model, including ``loss``; candidates are the searched layout and
             the uncorrected ones.
-        returned: the candidate whose largest loss over the models is the smallest.
+        returned: the candidate with the smallest loss over all models (``Task.over_models``).
         figure: the first figure of the task; ``less``: whether it is better when lower.
         loss_unit: factor from the loss to the figure that includes the model's own error; None if the loss is
             no such error.

@@ -43,8 +43,8 @@ class How(TypedDict, total=False):
     Attributes:
         judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
             by default the zoo's models that were trained on the same prints.
-        robust: search also through those judges that have gradients: for the lowest worst loss, plus a
-            penalty on the models' disagreement.
+        robust: search also through those judges that have gradients: for the lowest loss over all models
+            (``Task.over_models``), plus a penalty on their disagreement.
         device: device of the models.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting (the default).

@@ -10,13 +10,11 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 from litho_data.commands.progress import command_line, progress
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.results import Result
 from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab.jobs import Plan
@@ -32,16 +30,6 @@ BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
 # Maps a dataset store and an empty working folder to the loop's answer.
 Loop = Callable[[Path, Path], Answer]
-
-
-class Judged(Result):
-    """The board and loop that a folder of judged trials belongs to."""
-
-    SCHEMA: ClassVar[str] = "litho-models/board-judged/1"
-    FILE_NAME: ClassVar[str] = "judged.json"
-
-    draws_sha256: str
-    loop: str
 
 
 def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
@@ -123,12 +111,9 @@ def judge_board(
     source = Path(board)
     draws = Draws.read(source)
     asked = loop or partial(own_loop, base=draws.base, report=report)
-    judged_as = Judged(
-        draws_sha256=file_sha256(source / Draws.FILE_NAME),
-        loop=name or (getattr(loop, "__name__", "a loop") if loop else "litho-models close-loop"),
-    )
-    facts = judged_as.model_dump(mode="json", exclude={"schema_"})
-    with growing_folder(out, Judged.FILE_NAME, facts) as begun:
+    usual = getattr(loop, "__name__", "a loop") if loop else "litho-models close-loop"
+    facts = {"draws_sha256": file_sha256(source / Draws.FILE_NAME), "loop": name or usual}
+    with growing_folder(out, Scoreboard.FILE_NAME, facts) as begun:
         for draw in progress(draws.trials, "judging"):
             folder = begun.folder / TRIALS / name_of(draw)
             if not (folder / Trial.FILE_NAME).exists():
@@ -138,10 +123,9 @@ def judge_board(
                 trial.write(folder)
                 report(trial_line(trial))
         done = [Trial.read(begun.folder / TRIALS / name_of(draw)) for draw in draws.trials]
-        scoreboard = make_scoreboard(draws, done, command_line())
-        scoreboard.write(begun.folder)
+        scoreboard = make_scoreboard(draws, done, command_line()).model_copy(update=facts)
         trial_table(scoreboard).to_csv(begun.folder / "scoreboard.csv", index=False)
-        judged_as.write(begun.folder)
+        scoreboard.write(begun.folder)
     return scoreboard
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS, OFF_CATALOGUE
-from litho_models.boards.other_forms import FORMS
+from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
@@ -87,7 +87,7 @@ def _other_forms() -> list[str]:
     return [form.name for form in FORMS.values() if form.deck == "both"]
 
 
-def _draw_singles(rng: np.random.Generator) -> list[Draw]:
+def _draw_singles(rng: Rng) -> list[Draw]:
     aliases = [one.name for one in KNOBS.values() if one.nuisance_span or one.refit_absorbs]
     decks: dict[Kind, Iterator[str]] = {
         "in-form": _deal(_in_form(), rng),
@@ -108,7 +108,7 @@ def _draw_singles(rng: np.random.Generator) -> list[Draw]:
     return trials
 
 
-def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
+def _draw_mixtures(rng: Rng) -> list[Draw]:
     """Draw about as many causes in form as of another form. No two in a trial share a right name."""
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -143,7 +143,7 @@ def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
     ]
 
 
-def _in_groups(cause: CauseDraw, at: int, rng: np.random.Generator) -> CauseDraw:
+def _in_groups(cause: CauseDraw, at: int, rng: Rng) -> CauseDraw:
     """Make the strength of the first causes of a mixtures board differ by batch or by field."""
     if at < LINEAR:
         return _by_batch(cause, rng)
@@ -154,28 +154,28 @@ def _in_groups(cause: CauseDraw, at: int, rng: np.random.Generator) -> CauseDraw
     return cause
 
 
-def _seed(rng: np.random.Generator) -> int:
+def _seed(rng: Rng) -> int:
     return int(rng.integers(2**31))
 
 
-def _draw_printer(rng: np.random.Generator) -> dict[str, float]:
+def _draw_printer(rng: Rng) -> dict[str, float]:
     return {name: round(rng.uniform(*limits), 3) for name, limits in _PRINTER_RANGES.items()}
 
 
-def _by_batch(cause: CauseDraw, rng: np.random.Generator) -> CauseDraw:
+def _by_batch(cause: CauseDraw, rng: Rng) -> CauseDraw:
     """Make a cause weaker after a point near the middle of the printing order."""
     place, weak = f"{rng.uniform(-0.2, 0.2):.3f}", round(rng.uniform(0.0, 0.6), 3)
     return cause.model_copy(update={"by": "batch", "place": place, "weak": weak})
 
 
-def _by_field(cause: CauseDraw, rng: np.random.Generator, weak: float | None = None) -> CauseDraw:
+def _by_field(cause: CauseDraw, rng: Rng, weak: float | None = None) -> CauseDraw:
     """Make a cause weaker in two of the four fields of each print."""
     place = "".join(sorted(rng.permutation(list("1234"))[:2]))
     weak = round(rng.uniform(0.0, 0.6), 3) if weak is None else weak
     return cause.model_copy(update={"by": "field", "place": place, "weak": weak})
 
 
-def _deal(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
+def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
     own = np.random.default_rng(rng.integers(2**63))
     while True:
         yield from (names[i] for i in own.permutation(len(names)))
@@ -192,5 +192,5 @@ def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], ref
     return names
 
 
-def _size_nm(rng: np.random.Generator, limits: tuple[float, float]) -> float:
+def _size_nm(rng: Rng, limits: tuple[float, float]) -> float:
     return float(np.exp(rng.uniform(*np.log(limits))))

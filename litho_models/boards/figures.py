@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 
 from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
-from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Scoreboard, Trial, Verdict
+from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Outcome, Scoreboard, Trial, Verdict
 
 # Largest accepted error with the findings, as a multiple of the true models' error.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
@@ -27,14 +27,6 @@ class Figure(NamedTuple):
     what: str
     value: str
     wanted: str = ""
-
-
-class Counted(NamedTuple):
-    """A planted cause that counts: its trial, its name and its outcome."""
-
-    trial: Trial
-    name: str
-    verdict: Verdict
 
 
 def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scoreboard:
@@ -61,17 +53,13 @@ def share(hits: Iterable[bool]) -> str:
     return f"{sum(known)} of {len(known)} ({100 * interval.low:.0f}–{100 * interval.high:.0f} %)"
 
 
-def counted(trials: Iterable[Trial]) -> list[Counted]:
-    """Causes above 8 nm; if a trial failed before sizing, causes drawn above 8 nm."""
+def counted(trials: Iterable[Trial]) -> list[Outcome]:
+    """Outcomes of causes above 8 nm; if a trial failed before sizing, of causes drawn above 8 nm."""
     found = []
     for trial in trials:
         sizes = {one.name: one.wanted_rms_nm for one in trial.draw.causes}
         sizes |= {one.draw.name: one.rms_nm for one in trial.planted}
-        found += [
-            Counted(trial, one.name, one.verdict)
-            for one in trial.outcomes
-            if sizes.get(one.name, 0.0) > COUNTS_FROM_RMS_NM
-        ]
+        found += [one for one in trial.outcomes if sizes.get(one.name, 0.0) > COUNTS_FROM_RMS_NM]
     return found
 
 
@@ -115,12 +103,7 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 def reaches_floor(trial: Trial) -> bool:
     """Whether the error with the findings is within the tolerance; False if unknown."""
     ratio = trial.errors.ratio if trial.errors else None
-    return ratio is not None and ratio <= tolerance(trial)
-
-
-def tolerance(trial: Trial) -> float:
-    """Largest accepted error with the findings, as a multiple of the true models' error."""
-    return TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
+    return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 
 
 def _of_singles(trials: Sequence[Trial]) -> list[Figure]:
@@ -182,7 +165,7 @@ def _of_kind(trials: Iterable[Trial], kind: str) -> list[Trial]:
     return [trial for trial in trials if trial.draw.kind == kind]
 
 
-def _causes(what: str, causes: Iterable[Counted], verdicts: Sequence[Verdict], wanted: str = "") -> Figure:
+def _causes(what: str, causes: Iterable[Outcome], verdicts: Sequence[Verdict], wanted: str = "") -> Figure:
     return Figure(what, share(one.verdict in verdicts for one in causes), wanted)
 
 

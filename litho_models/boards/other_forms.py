@@ -16,15 +16,17 @@ import scipy.ndimage
 import scipy.signal
 import scipy.special
 
+from litho_data.foundation.kinds import Array
 from litho_data.virtual_fab import Cause, Job, Printer
 from litho_data.virtual_fab.canvas import Canvas, apply_transfer, blur, frequencies_per_um
 from litho_data.virtual_fab.geometry import ScanFrame
 
+Rng = np.random.Generator
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
 # Maps (field, strength, canvas or frame of the scan, job) to the changed field.
-Law = Callable[..., np.ndarray]
-Draw = Callable[[np.random.Generator], Law]
+Law = Callable[..., Array]
+Draw = Callable[[Rng], Law]
 
 # The spot of the fab: sd of the squared intensity, µm.
 _SPOT_UM = 0.2
@@ -65,16 +67,16 @@ class FormCause(Cause):
             if strength
         ]
 
-    def on_dose(self, dose: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
         return np.maximum(self._at("dose", dose, canvas, job), 0.0)
 
-    def on_surface(self, surface_um: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+    def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
         return self._at("surface", surface_um, canvas, job)
 
-    def on_scan(self, height_um: np.ndarray, frame: ScanFrame, job: Job) -> np.ndarray:
+    def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
         return self._at("scan", height_um, frame, job)
 
-    def _at(self, stage: Stage, field: np.ndarray, place: Canvas | ScanFrame, job: Job) -> np.ndarray:
+    def _at(self, stage: Stage, field: Array, place: Canvas | ScanFrame, job: Job) -> Array:
         for own, strength, law in self._laws:
             if own == stage:
                 field = law(field, strength, place, job)
@@ -102,11 +104,11 @@ def _form(
 
 
 @_form("far-copy", "dose", "1", 0.6)
-def _far_copy(rng: np.random.Generator) -> Law:
+def _far_copy(rng: Rng) -> Law:
     """Relative dose of a copy displaced by 6–15 µm in a random direction."""
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = distance_um / canvas.pitch_um * np.array([np.sin(direction), np.cos(direction)])
         # The copy may lie beyond the frame, where the outermost levels continue.
         rows, columns = (
@@ -118,14 +120,14 @@ def _far_copy(rng: np.random.Generator) -> Law:
 
 
 @_form("oriented-ringing", "dose", "1", 2.0)
-def _oriented_ringing(rng: np.random.Generator) -> Law:
+def _oriented_ringing(rng: Rng) -> Law:
     """Relative gain at one period (2–5 µm) along one direction, ringing over 2–5 µm."""
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         along = _frequency_along(canvas, direction)
 
-        def peak(at: np.ndarray | float) -> np.ndarray:
+        def peak(at: Array | float) -> Array:
             return 1 / (1 + (2 * np.pi * decay_um * np.asarray(at)) ** 2)
 
         ringing = peak(along - 1 / period_um) + peak(along + 1 / period_um) - 2 * peak(1 / period_um)
@@ -135,7 +137,7 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
 
 
 @_form("oriented-proximity", "dose", "1", 1.0)
-def _oriented_proximity(rng: np.random.Generator) -> Law:
+def _oriented_proximity(rng: Rng) -> Law:
     """Dose spread over 4–8 µm along one direction, relative to the focused dose."""
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: _spread(
@@ -144,11 +146,11 @@ def _oriented_proximity(rng: np.random.Generator) -> Law:
 
 
 @_form("halo-ring", "dose", "1", 1.0)
-def _halo_ring(rng: np.random.Generator) -> Law:
+def _halo_ring(rng: Rng) -> Law:
     """Dose on a ring of 4–9 µm radius, relative to the focused dose."""
     radius_um = rng.uniform(4, 9)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         frequency = np.hypot(*frequencies_per_um(dose.shape, canvas.pitch_um))
         return _spread(dose, strength, scipy.special.j0(2 * np.pi * radius_um * frequency))
 
@@ -156,11 +158,11 @@ def _halo_ring(rng: np.random.Generator) -> Law:
 
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
-def _fast_axis_memory(rng: np.random.Generator) -> Law:
+def _fast_axis_memory(rng: Rng) -> Law:
     """Share of the dose lost after earlier writing in the hatch line; fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         keeps = np.exp(-canvas.pitch_um / decay_um)
         return dose - strength * scipy.signal.lfilter([0.0, 1 - keeps], [1.0, -keeps], dose, axis=1)
 
@@ -168,7 +170,7 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
 
 
 @_form("crowding", "dose", "1", 4.0)
-def _crowding(rng: np.random.Generator) -> Law:
+def _crowding(rng: Rng) -> Law:
     """Relative gain of the dose with the cube of the density over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
@@ -177,11 +179,11 @@ def _crowding(rng: np.random.Generator) -> Law:
 
 
 @_form("alternate-slices", "dose", "1", 2.0)
-def _alternate_slices(rng: np.random.Generator) -> Law:
+def _alternate_slices(rng: Rng) -> Law:
     """Slices too many or too few in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         wrong = (canvas.level % 2 == odd) & (canvas.level > 0)
         return dose + sign * strength / 12 * blur(wrong.astype(float), canvas.pitch_um, _SPOT_UM)
 
@@ -189,7 +191,7 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
 
 
 @_form("focus-step", "dose", "µm", 2.0)
-def _focus_step(rng: np.random.Generator) -> Law:
+def _focus_step(rng: Rng) -> Law:
     """Sd added to the spot from a random print near the middle on."""
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
@@ -201,7 +203,7 @@ def _focus_step(rng: np.random.Generator) -> Law:
 
 
 @_form("cubic-slope-loss", "surface", "µm", 8.0, names=("slope-thinning",))
-def _cubic_slope_loss(rng: np.random.Generator) -> Law:
+def _cubic_slope_loss(rng: Rng) -> Law:
     """Height lost per cubed slope in any direction."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.hypot(*np.gradient(surface, canvas.pitch_um)) ** 3
@@ -209,7 +211,7 @@ def _cubic_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("diagonal-slope-loss", "surface", "µm", 4.0, names=("slope-thinning",))
-def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
+def _diagonal_slope_loss(rng: Rng) -> Law:
     """Height lost per squared slope along one direction, 30–60° from the axes."""
     direction = rng.uniform(np.pi / 6, np.pi / 3) + rng.integers(2) * np.pi / 2
     return lambda surface, strength, canvas, job: (
@@ -218,7 +220,7 @@ def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
-def _lee_side_loss(rng: np.random.Generator) -> Law:
+def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall in one direction."""
     # This is half a loss on both flanks and half a displacement, which registration removes.
     direction = rng.uniform(0, 2 * np.pi)
@@ -228,7 +230,7 @@ def _lee_side_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("plateau", "surface", "1", 1.0)
-def _plateau(rng: np.random.Generator) -> Law:
+def _plateau(rng: Rng) -> Law:
     """Share of the height lost between two heights 0.15–0.25 µm apart; 1: a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
@@ -237,7 +239,7 @@ def _plateau(rng: np.random.Generator) -> Law:
 
 
 @_form("fringes", "surface", "nm", 150.0)
-def _fringes(rng: np.random.Generator) -> Law:
+def _fringes(rng: Rng) -> Law:
     """Amplitude of an error periodic in the height, with period 0.12–0.3 µm."""
     period_um, phase = rng.uniform(0.12, 0.3), rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
@@ -246,7 +248,7 @@ def _fringes(rng: np.random.Generator) -> Law:
 
 
 @_form("overshoot", "surface", "1", 2.0)
-def _overshoot(rng: np.random.Generator) -> Law:
+def _overshoot(rng: Rng) -> Law:
     """Gain of detail finer than 0.6–1.2 µm, so edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
@@ -255,11 +257,11 @@ def _overshoot(rng: np.random.Generator) -> Law:
 
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
-def _blur_with_height(rng: np.random.Generator) -> Law:
+def _blur_with_height(rng: Rng) -> Law:
     """Share of a surface blurred by 0.5–1 µm, growing with the height."""
     reach_um = rng.uniform(0.5, 1)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         blurred = blur(surface, canvas.pitch_um, reach_um)
         return surface + np.clip(strength * blurred, 0.0, 1.0) * (blurred - surface)
 
@@ -270,11 +272,11 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
 
 
 @_form("blur-across-field", "surface", "1", 1.0)
-def _blur_across_field(rng: np.random.Generator) -> Law:
+def _blur_across_field(rng: Rng) -> Law:
     """Share of a surface blurred by 0.7–1.2 µm at one side of the field, 0 at the other."""
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         across = _across(canvas, axis=side // 2)
         weight = np.clip(across if side % 2 else 1 - across, 0.0, 1.0)
         return surface + strength * weight * (blur(surface, canvas.pitch_um, reach_um) - surface)
@@ -283,25 +285,25 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
 
 
 @_form("seam-in-gain", "surface", "1", 0.6)
-def _seam_in_gain(rng: np.random.Generator) -> Law:
+def _seam_in_gain(rng: Rng) -> Law:
     """Share of the height lost on one side of a seam through the field."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-    return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, side, place))
+    seam = _seam(rng)
+    return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, *seam))
 
 
 @_form("seam-in-height", "surface", "nm", 300.0)
-def _seam_in_height(rng: np.random.Generator) -> Law:
+def _seam_in_height(rng: Rng) -> Law:
     """Step of the height at a seam through the field."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-    return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, side, place)
+    seam = _seam(rng)
+    return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, *seam)
 
 
 @_form("seam-in-place", "surface", "µm", 1.5)
-def _seam_in_place(rng: np.random.Generator) -> Law:
+def _seam_in_place(rng: Rng) -> Law:
     """Displacement of one side of a seam along the seam."""
-    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
+    side, place = _seam(rng)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = np.zeros(2)
         shift[1 - side // 2] = strength / canvas.pitch_um
         moved = scipy.ndimage.shift(surface, shift, order=3, mode="nearest")
@@ -311,11 +313,11 @@ def _seam_in_place(rng: np.random.Generator) -> Law:
 
 
 @_form("rim", "surface", "1", 1.0)
-def _rim(rng: np.random.Generator) -> Law:
+def _rim(rng: Rng) -> Law:
     """Relative gain of the height at the layout's edge, fading over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         (size_y, size_x), y, x = canvas.size_um, canvas.y_um, canvas.x_um
         inwards = np.minimum(np.minimum(y, size_y - y), np.minimum(x, size_x - x))
         return surface * (1 + strength * np.exp(-np.maximum(inwards, 0.0) / reach_um))
@@ -327,11 +329,11 @@ def _rim(rng: np.random.Generator) -> Law:
 
 
 @_form("periodic-lines", "scan", "nm", 150.0)
-def _periodic_lines(rng: np.random.Generator) -> Law:
+def _periodic_lines(rng: Rng) -> Law:
     """Amplitude of line offsets of period 6–20 lines; each scan has a new phase."""
     period, phases = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, _MOST_SCANS)
 
-    def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
+    def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
         line = np.arange(frame.shape[0])[:, None]
         return height + 1e-3 * strength * np.sin(2 * np.pi * line / period + phases[job.index % _MOST_SCANS])
 
@@ -342,7 +344,7 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
 
 
 @_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
-def _linear_slope_loss(rng: np.random.Generator) -> Law:
+def _linear_slope_loss(rng: Rng) -> Law:
     """Height lost per absolute slope along the hatch lines."""
     return lambda surface, strength, canvas, job: (
         surface - strength * np.abs(_slope_along(surface, canvas, direction=0.0))
@@ -350,11 +352,11 @@ def _linear_slope_loss(rng: np.random.Generator) -> Law:
 
 
 @_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
-def _s_shaped_axis(rng: np.random.Generator) -> Law:
+def _s_shaped_axis(rng: Rng) -> Law:
     """Displacement along x, quadratic and cubic in x with random shares."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
-    def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
+    def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
         x = frame.unit_axes[1]
         moved_um = np.cos(share) * (1.5 * x**2 - 0.5) + np.sin(share) * (2.5 * x**3 - 1.5 * x)
         rows, columns = np.indices(height.shape, dtype=float)
@@ -368,7 +370,7 @@ def _s_shaped_axis(rng: np.random.Generator) -> Law:
 
 
 @_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
-def _two_part_spot(rng: np.random.Generator) -> Law:
+def _two_part_spot(rng: Rng) -> Law:
     """Share of the spot in a second part with sd 0.5–0.9 µm."""
     width_um = rng.uniform(0.5, 0.9)
     return lambda dose, strength, canvas, job: (
@@ -379,11 +381,11 @@ def _two_part_spot(rng: np.random.Generator) -> Law:
 @_form(
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
-def _hill_response(rng: np.random.Generator) -> Law:
+def _hill_response(rng: Rng) -> Law:
     """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) beside the logistic one."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+    def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         # Doses at which the default printer's logistic gives the Hill curve's conversion at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
@@ -396,7 +398,7 @@ def _hill_response(rng: np.random.Generator) -> Law:
 
 
 @_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
-def _elliptical_blur(rng: np.random.Generator) -> Law:
+def _elliptical_blur(rng: Rng) -> Law:
     """Sd added to the spot along one direction."""
     direction = rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: apply_transfer(
@@ -404,28 +406,33 @@ def _elliptical_blur(rng: np.random.Generator) -> Law:
     )
 
 
-def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:
+def _spread(dose: Array, strength: float, transfer: Array) -> Array:
     """Mix the dose with the dose spread by a transfer function (1 at f = 0), with weight ``strength``."""
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
-def _frequency_along(canvas: Canvas, direction: float) -> np.ndarray:
+def _frequency_along(canvas: Canvas, direction: float) -> Array:
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
     return frequency_x * np.cos(direction) + frequency_y * np.sin(direction)
 
 
-def _slope_along(surface: np.ndarray, canvas: Canvas, direction: float) -> np.ndarray:
+def _slope_along(surface: Array, canvas: Canvas, direction: float) -> Array:
     slope_y, slope_x = np.gradient(surface, canvas.pitch_um)
     return slope_x * np.cos(direction) + slope_y * np.sin(direction)
 
 
-def _across(canvas: Canvas, axis: int) -> np.ndarray:
+def _across(canvas: Canvas, axis: int) -> Array:
     """Position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the last."""
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
-def _beyond(canvas: Canvas, side: int, place: float) -> np.ndarray:
+def _seam(rng: Rng) -> tuple[int, float]:
+    """A side, and the place of a seam through the field, for ``_beyond``."""
+    return int(rng.integers(4)), rng.uniform(0.35, 0.65)
+
+
+def _beyond(canvas: Canvas, side: int, place: float) -> Array:
     """True on one side of a seam; ``side`` gives the axis that it crosses, and the side."""
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

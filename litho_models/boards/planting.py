@@ -7,7 +7,7 @@ registration error are free in each scan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,7 +93,7 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
     absorbs most of it.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
-    return [(_as_alias if draw.kind == "alias" else _sized)(one, jobs, draw) for one in drawn]
+    return [_sized(one, jobs, draw) for one in drawn]
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
@@ -185,36 +185,23 @@ def _as_scan(job: Job, height_um: np.ndarray, printer: Printer) -> PrintedScan:
 
 
 def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    wanted, limit = drawn.wanted_rms_nm, _limit(drawn.name)
+    wanted, limit, printer = drawn.wanted_rms_nm, _limit(drawn.name), printer_of(draw)
     few = [jobs[i] for i in np.linspace(0, len(jobs) - 1, min(_SOUGHT_ON, len(jobs))).round().astype(int)]
 
-    def on(fields: Sequence[Job]) -> Callable[[float], float]:
-        def left_nm(strength: float) -> float:
-            heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], fields)
-            return refitted_rms_nm(heights, fields, printer_of(draw))
-
-        return left_nm
-
-    strength, at_limit = limit, on(few)(limit)
-    if at_limit > wanted:
-        strength, _ = search_strength(
-            on(few), wanted, highest=limit, at_highest=at_limit, precision=_PRECISION
-        )
-    return _planted(drawn, strength, on(jobs)(strength))
-
-
-def _as_alias(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    """Size an alias by its change of the noise-free scans, without the scan terms."""
-    wanted, printer, limit = drawn.wanted_rms_nm, printer_of(draw), _limit(drawn.name)
+    def left_nm(strength: float, fields: Sequence[Job] = few) -> float:
+        heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], fields)
+        return refitted_rms_nm(heights, fields, printer)
 
     def change_nm(strength: float) -> float:
         return knob_rms_nm(KnobSetting(drawn.name, strength, draw.seed), jobs, printer=printer)
 
-    strength, at_limit = limit, change_nm(limit)
+    measured, precision = (change_nm, 0.01) if draw.kind == "alias" else (left_nm, _PRECISION)
+    strength, at_limit = limit, measured(limit)
     if at_limit > wanted:
-        strength, _ = search_strength(change_nm, wanted, highest=limit, at_highest=at_limit)
-    heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], jobs)
-    return _planted(drawn, strength, refitted_rms_nm(heights, jobs, printer))
+        strength, _ = search_strength(
+            measured, wanted, highest=limit, at_highest=at_limit, precision=precision
+        )
+    return _planted(drawn, strength, left_nm(strength, jobs))
 
 
 def _limit(name: str) -> float:

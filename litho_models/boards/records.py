@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -59,8 +59,8 @@ class Draw(Record):
 class Draws(Result):
     """All trials of a board, written before any trial runs; ``base``: the model that loops correct."""
 
-    SCHEMA: ClassVar[str] = "litho-models/blind-trial-draws/2"
-    FILE_NAME: ClassVar[str] = "draws.json"
+    SCHEMA = "litho-models/blind-trial-draws/2"
+    FILE_NAME = "draws.json"
 
     board: Board
     seed: int
@@ -95,8 +95,8 @@ class Planted(Record):
 class Hidden(Result):
     """The hidden causes of one store; the loop does not see this file."""
 
-    SCHEMA: ClassVar[str] = "litho-models/board-hidden/1"
-    FILE_NAME: ClassVar[str] = "hidden.json"
+    SCHEMA = "litho-models/board-hidden/1"
+    FILE_NAME = "hidden.json"
 
     planted: list[Planted]
 
@@ -152,8 +152,8 @@ class Answer(Result):
         base_values, corrected_values: values of the Physics model, without and with the findings.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/board-answer/1"
-    FILE_NAME: ClassVar[str] = "answer.json"
+    SCHEMA = "litho-models/board-answer/1"
+    FILE_NAME = "answer.json"
 
     found: list[Found] = Field(default_factory=list)
     left: bool = False
@@ -165,7 +165,8 @@ class Answer(Result):
     corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
-class Trial(Result):
+# Older results also have the loop's verdict and its base.
+class Trial(Result, extra="ignore"):
     """The result of one trial; a failed one has a reason and no errors.
 
     Attributes:
@@ -175,16 +176,14 @@ class Trial(Result):
         dataset_cpu_s: processor seconds of build and loop.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/blind-trial/2"
-    FILE_NAME: ClassVar[str] = "trial.json"
+    SCHEMA = "litho-models/blind-trial/2"
+    FILE_NAME = "trial.json"
 
     draw: Draw
     planted: list[Planted]
     outcomes: list[Outcome]
     false_names: list[str] = Field(default_factory=list)
     found: list[Found] = Field(default_factory=list)
-    verdict: str = ""
-    base_model: str = ""
     errors: TrialErrors | None = None
     bias: tuple[float, float] | None = None
     dataset_cpu_s: float | None = None
@@ -192,15 +191,20 @@ class Trial(Result):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard."""
+    """All trials of a board; ``pending``: drawn but not run; ``command``: reproduces the scoreboard.
 
-    SCHEMA: ClassVar[str] = "litho-models/blind-trials/3"
-    FILE_NAME: ClassVar[str] = "scoreboard.json"
+    ``loop``: name of the judged loop; ``draws_sha256``: hash of ``draws.json``, of a judged board.
+    """
+
+    SCHEMA = "litho-models/blind-trials/3"
+    FILE_NAME = "scoreboard.json"
 
     command: str
     commit: str
     versions: dict[str, str]
     board: Board
     seed: int
+    loop: str = ""
+    draws_sha256: str = ""
     pending: list[int]
     trials: list[Trial]

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from litho_data.commands.app import argument, option
 from litho_data.commands.progress import say
 
 board = typer.Typer(help="Blind boards: can a loop name the hidden causes?", no_args_is_help=True)
@@ -14,16 +15,14 @@ board = typer.Typer(help="Blind boards: can a loop name the hidden causes?", no_
 
 @board.command("new")
 def new(
-    out: Annotated[Path, typer.Option("--out", help="folder of the board")],
+    out: Annotated[Path, option("folder of the board")],
     kind: Annotated[
-        Literal["singles", "mixtures"], typer.Option("--kind", help="one cause per store, or two to four")
+        Literal["singles", "mixtures"], option("one cause per store, or two to four")
     ] = "singles",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of everything that is drawn")] = 0,
-    trials: Annotated[
-        int | None, typer.Option("--trials", min=1, help="number of stores; by default all, about 40")
-    ] = None,
-    scans: Annotated[int, typer.Option("--scans", min=2, help="scans in each store")] = 12,
-    size_px: Annotated[int, typer.Option("--size-px", help="side of a layout, pixels of 0.1 µm")] = 256,
+    seed: Annotated[int, option("seed of everything that is drawn", min=0)] = 0,
+    trials: Annotated[int | None, option("number of stores; by default all, about 40", min=1)] = None,
+    scans: Annotated[int, option("scans in each store", min=2)] = 12,
+    size_px: Annotated[int, option("side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:
     """Print and scan in the virtual fab with hidden causes: stores for a loop, the truth for the judge.
 
@@ -39,14 +38,13 @@ def new(
 
 @board.command("judge")
 def judge(
-    folder: Annotated[Path, typer.Argument(help="folder of `board new`", metavar="BOARD")],
-    out: Annotated[Path, typer.Option("--out", help="folder of the trials, figures and table")],
+    board: Annotated[Path, argument("folder of `board new`")],
+    out: Annotated[Path, option("folder of the trials, figures and table")],
     loop: Annotated[
         str | None,
-        typer.Option(
-            "--loop",
-            help="command of the loop: its last arguments are STORE and FOLDER; writes FOLDER/answer.json; "
-            "by default close-loop of this package",
+        option(
+            "command of the loop: its last arguments are STORE and FOLDER; writes FOLDER/answer.json; "
+            "by default close-loop of this package"
         ),
     ] = None,
 ) -> None:
@@ -58,7 +56,7 @@ def judge(
     from litho_models.boards.figures import figure_lines
 
     scoreboard = judge_board(
-        folder,
+        board,
         out,
         command_loop(loop) if loop else None,
         name=loop,

@@ -171,7 +171,7 @@ class Effect:
             of its ``tried`` values, in each shape.
         source: source of the formula.
         separating: experiment that separates it from similar effects.
-        needs: facts about the print that its test requires.
+        needs: what its test requires: a known order of the scans, a microscope with a probe.
         reverses: parameters with the opposite sign on retrace lines.
         of_tip: whether a new tip removes it.
         of_films: whether it moves the edges of a film seen from above; other effects change heights.
@@ -188,7 +188,7 @@ class Effect:
     source: str
     separating: str = ""
     trials: tuple[Mapping[str, float], ...] = ()
-    needs: tuple[Literal["order"], ...] = ()
+    needs: tuple[Literal["order", "probe"], ...] = ()
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
     of_films: bool = False

@@ -18,11 +18,10 @@ from torch.nn import functional
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-_RIM_UM, _BLURRED_UM = 2.0, 1.5
 # Over a micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
 _WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
 _FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
-_WORDS = ("x", "y", "r²", "rim")
+_WORDS = ("x", "y", "r²")
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
 _COPIES_UM = {
     f"from_{1000 * dy:+.0f}_{1000 * dx:+.0f}_nm": (dy, dx)
@@ -64,12 +63,12 @@ class Surface:
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """x, y, r² or the closeness to the scan's edge, e^(-distance / 2 µm), of each pixel."""
+        """x, y, r² or the closeness to the scan's edge, e^(-distance / length), of each pixel."""
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
             own_um = [side * (1 - one.abs()) for side, one in zip(sides_um, (y, x), strict=True)]
-            return torch.exp(-torch.minimum(*own_um) / _RIM_UM).to(self.h)
+            return torch.exp(-torch.minimum(*own_um) / self.values["length_um"]).to(self.h)
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
@@ -80,10 +79,9 @@ class Surface:
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
-    def mean(self, of: Tensor | None = None, reach_um: float | Tensor | None = None) -> Tensor:
-        """Gaussian-weighted local mean of a map, by default the height within the law's length."""
-        field = self.h if of is None else of
-        reach = torch.as_tensor(self.values["length_um"] if reach_um is None else reach_um).to(self.h)
+    def mean(self, of: Tensor | None = None) -> Tensor:
+        """Gaussian-weighted local mean of a map (by default the height), within the law's length."""
+        field, reach = self.h if of is None else of, self.values["length_um"]
         return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
     def trailing(self, *sides: str) -> Tensor:
@@ -111,6 +109,8 @@ _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
 _TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0))}
+# Where a place is known, one trial of the length is near enough to start from.
+_NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 
 def _fixed() -> Iterator[Facts]:
@@ -121,6 +121,11 @@ def _fixed() -> Iterator[Facts]:
     yield "height-power-3", "h³", "µm³", lambda s: s.h**3
     yield "height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order
     yield from (_height_at(word) for word in _WORDS)
+
+
+def _at_place() -> Iterator[Facts]:
+    yield _height_at("rim")
+    yield from (_slope_at(axis, "rim") for axis in ("x", "y"))
     yield from (_blurred_at(word) for word in _WORDS)
 
 
@@ -162,8 +167,8 @@ def _height_at(word: str) -> Facts:
 
 
 def _blurred_at(word: str) -> Facts:
-    name, formula = f"blur-times-{word.replace('²', '2')}", f"(h̄({_BLURRED_UM} µm) - h) {word}"
-    return name, formula, "µm", lambda s: (s.mean(reach_um=_BLURRED_UM) - s.h) * s.place(word)
+    name = f"blur-times-{word.replace('²', '2')}"
+    return name, f"(h̄ - h) {word}", "µm", lambda s: (s.mean() - s.h) * s.place(word)
 
 
 def _jumps(axis: str) -> Iterator[Facts]:
@@ -229,7 +234,7 @@ def _nameless(
         parameters=parameters,
         apply=apply,
         source="found in the residual; h and the dose D in µm, h̄ the Gaussian mean of h over a length; "
-        "x and y from -1 to 1 over the scan, r² = x² + y², rim = e^(-distance to the edge / 2 µm), the "
+        "x and y from -1 to 1 over the scan, r² = x² + y², rim = e^(-distance to the edge / length), the "
         "order t from -0.5 to 0.5; slopes and sides are along axes turned by turn_deg",
         separating=_TURNED,
         knowledge="law",
@@ -286,6 +291,7 @@ _OF_HEIGHT: Families = (
     (map(_power, "xy"), {**_POWER, **_TURN}),
     ((*_one_way("x"), *_one_way("y")), _TURN),
     (_nearby(), _REACH),
+    (_at_place(), _NEAR),
     ((*_jumps("x"), *_jumps("y")), _POSITION),
 )
 _OF_DOSE: Families = (

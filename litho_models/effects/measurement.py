@@ -29,6 +29,7 @@ _BLUR_REACH_UM = 4.0
     source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
     separating="compare trace and retrace; scan at 0 and 90 degrees",
     reverses=("direction",),
+    needs=("probe",),
 )
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """The probe lags along the fast axis, mean delay removed: z += (H - z) / (1 + l / dx).
@@ -99,6 +100,7 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
     separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
     of_tip=True,
+    needs=("probe",),
 )
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """max over u of H(x - u) - u² / 2R, the path of a paraboloid tip; to first order H + R |grad H|² / 2.

@@ -9,15 +9,14 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from litho_data.commands.progress import progress, say, say_estimate
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import run_info
 from litho_data.sharing.sending import Known
 from litho_data.sharing.workers import Workers, run_jobs
-from litho_data.store import PrintedScan, open_store
+from litho_data.store import open_store
 from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.fit_cache import FitRecord, expected, fit_or_load
@@ -30,7 +29,7 @@ from litho_models.models import build_model, require_models
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.noise_floor import estimated_floor, stated_floor
-from litho_models.scoring.records import ModelScores, Prediction, paired_scores
+from litho_models.scoring.records import Prediction, paired_scores
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, Fold, ScoredSplit, SplitKind, plan_folds
 
@@ -87,8 +86,8 @@ def benchmark(
     scans = dataset.scans()
     film = dataset.instrument == "sem"
     policy, background = policy or usual_policy(film), background or usual_background(film)
-    if film:
-        settings = {"nuisance": "none", **(settings or {})}
+    given = {"seed": seed, **({"nuisance": "none"} if film else {}), **(settings or {})}
+    recipe = given.pop("recipe", "fast")
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
@@ -99,49 +98,35 @@ def benchmark(
         if not 1 <= first_folds <= made:
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")
         plan = [fold for fold in plan if fold.locked or fold.number < first_folds]
-    scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
+    open_folds, box = ([fold for fold in plan if fold.locked == last] for last in (False, True))
+    scored, boxed = ([scan for fold in part for scan in fold.held_out] for part in (open_folds, box))
+    ids = [scan.id for scan in scored]
     facts = {"dataset": {"name": dataset.name}, "split": {"kind": split, "seed": seed}}
     with growing_folder(out, Benchmark.FILE_NAME, facts, holds=CACHE_FOLDER) as begun:
-        _require_no_less(begun.folder, models, scored)
-        configs = {name: _config(name, settings, seed) for name in models}
-        fits: dict[tuple[str, int], FitRecord] = {}
-        predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
-        known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
-        places = Workers(workers, dask, known)
-        jobs: list[_Job] = [
-            (name, fold, configs[name], Path(out) / CACHE_FOLDER, background == "shared")
-            for name in models
-            for fold in plan
+        _require_no_less(begun.folder, models, ids)
+        configs = {name: training_config(recipe, name, given) for name in models}
+        cache = begun.folder / CACHE_FOLDER
+        jobs = [
+            (name, fold, configs[name], cache, background == "shared") for name in models for fold in plan
         ]
-        done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-        started = time.monotonic()
-        # Models differ too much for a common estimate, so each gives its own, unless the work runs elsewhere.
-        of = len(jobs) if places.elsewhere else 0
-        for (name, fold, *_), (record, heights) in progress(
-            done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of, at_once=workers
-        ):
-            if fold is plan[0] and not of:
-                rest = (len(plan) - 1) * (time.monotonic() - started)
-                say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
-            started = time.monotonic()
-            fits[name, fold.number] = record
-            predicted.setdefault((name, fold.locked), {}).update(
-                (scan.id, expected(record, background, scan, height))
-                for scan, height in zip(fold.held_out, heights, strict=True)
-            )
+        known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
+        fits = _fit_all(jobs, Workers(workers, dask, known), dataset.name)
         protocol = NuisanceProtocol.of_policy(policy, seed, background)
-        boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
 
-        def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
-            own = predicted[name, locked]
-            return score_model(name, judged, [own[scan.id] for scan in judged], protocol)
+        def predicted(name: str, folds: Sequence[Fold]) -> list[Prediction]:
+            return [
+                expected(record, background, scan, height)
+                for fold in folds
+                for record, heights in [fits[name, fold.number]]
+                for scan, height in zip(fold.held_out, heights, strict=True)
+            ]
 
-        scores = [score(name, scored, False) for name in models]
-        ids = [scan.id for scan in scored]
-        maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
+        predictions = {name: predicted(name, open_folds) for name in models}
+        scores = [score_model(name, scored, own, protocol) for name, own in predictions.items()]
+        maps = {name: [one.map_um for one in own] for name, own in predictions.items()}
         if noise is None:
             best = min(scores, key=lambda entry: entry.leading_nm).model
-            floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
+            floor = estimated_floor(best, scored, maps[best], protocol.blocks, seed)
         result = Benchmark(
             run=run_info([seed], len(scans)),
             dataset=dataset.dataset_id,
@@ -157,40 +142,56 @@ def benchmark(
             ),
             nuisance=protocol,
             noise_floor=floor,
-            training={name: _settings(name, config, scans) for name, config in configs.items()},
+            training={
+                name: config.used_by(build_model(name, config.variant, **common_geometry(scans)))
+                for name, config in configs.items()
+            },
             scores=scores,
-            locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
+            locked_scores=[
+                score_model(name, boxed, predicted(name, box), protocol) for name in models if boxed
+            ],
             paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
-            fits=[fits[name, fold.number] for name, fold, *_ in jobs],
+            fits=[fits[name, fold.number][0] for name, fold, *_ in jobs],
         )
         write_benchmark_report(result, scored, maps, out)
         result.write(out)
     return result
 
 
+# What ``fit_or_load`` takes.
 _Job = tuple[str, Fold, TrainingConfig, Path, bool]
+_Fits = dict[tuple[str, int], tuple[FitRecord, list[Array]]]
 
 
-def _fit(job: _Job) -> tuple[FitRecord, list[np.ndarray]]:
+def _fit(job: _Job) -> tuple[FitRecord, list[Array]]:
     return fit_or_load(*job)
 
 
-def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingConfig:
-    given = {"seed": seed, **(settings or {})}
-    return training_config(given.pop("recipe", "fast"), name, given)
+def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
+    """The fits by model and number of the fold, with the heights of the scans held out of them."""
+    fits: _Fits = {}
+    done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
+    # Models differ too much for a common estimate, so each gives its own, unless the work runs elsewhere.
+    of = len(jobs) if places.elsewhere else 0
+    first, rest = jobs[0][1], len({job[1].number for job in jobs}) - 1
+    started = time.monotonic()
+    for (name, fold, *_), fitted in progress(
+        done, f"benchmark of {dataset}", len(jobs), estimate_of=of, at_once=places.processes
+    ):
+        if fold is first and not of:
+            say_estimate(f"{name} on the other {rest} folds", rest * (time.monotonic() - started))
+        started = time.monotonic()
+        fits[name, fold.number] = fitted
+    return fits
 
 
-def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
-    return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
-
-
-def _require_no_less(folder: Path, models: Sequence[str], scored: Sequence[PrintedScan]) -> None:
+def _require_no_less(folder: Path, models: Sequence[str], scored_ids: Sequence[str]) -> None:
     """Refuse to replace a benchmark that contains more; the same one may be repeated or extended."""
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)
     lost = [score.model for score in old.scores if score.model not in models]
-    more = set(old.split.scored_ids) - {scan.id for scan in scored}
+    more = set(old.split.scored_ids) - set(scored_ids)
     held = [f"model {', '.join(lost)}"] * bool(lost) + [f"{len(more)} scans more"] * bool(more)
     if held:
         raise InputError(

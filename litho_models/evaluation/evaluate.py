@@ -1,6 +1,5 @@
 """Evaluate one frozen model on a dataset: ``evaluation.json`` and a report."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.commands.progress import progress
@@ -35,7 +34,6 @@ def evaluate(
     policy: Policy | None = None,
     background: BackgroundUse | None = None,
     noise: str | Path | None = None,
-    scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
     open_lock_box: bool = False,
 ) -> Evaluation:
@@ -55,7 +53,6 @@ def evaluate(
             ``none`` does not (the default for films). A card without a background, or with one for fields of
             another size, adds none, and the result says so.
         noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors.
-        scan_ids: score exactly these scans, even locked ones.
         extrapolate: accept layouts beyond the model's calibrated range.
         open_lock_box: also score the locked scans of the prints that the model was trained on.
 
@@ -74,11 +71,8 @@ def evaluate(
         every = dataset.scans()
         kept = locked_by_the_card(frozen, dataset)
         locked = sorted({*dataset.locked_ids, *kept})
-        if scan_ids is not None:
-            scans = [dataset.scan(scan_id) for scan_id in scan_ids]
-        else:
-            own = made_of_these_prints(frozen, dataset)
-            scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
+        locked_too = open_lock_box or not made_of_these_prints(frozen, dataset)
+        scans = [scan for scan in every if locked_too or scan.id not in locked]
         if not scans:
             raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
         ids = [scan.id for scan in scans]

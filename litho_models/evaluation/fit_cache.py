@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import ConfigDict, Field
 
 from litho_data.commands.progress import progress
 from litho_data.foundation.files import atomic_folder
@@ -16,7 +15,7 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.fitting import Fitted, TrainingConfig, fit_in_cache
 from litho_models.fitting.checkpoint import reading_kept
-from litho_models.fitting.fit import common_geometry, run_key
+from litho_models.fitting.fit import FitFacts, common_geometry, run_key
 from litho_models.models import build_model
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms import BackgroundUse
@@ -29,16 +28,14 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-class FitDiagnostics(Record):
+# Older results also say what a prediction cost, and how it changes in another crop.
+class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training scans and on held-out scans.
 
     All three are the mean over scans of the datum-free error of policy ``offset``, without a background, so
     that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
     ``measurement``: the measurement model learned with the fit, if the training scans were freed of it.
     """
-
-    # Older results also say what a prediction cost, and how it changes in another crop.
-    model_config = ConfigDict(extra="ignore")
 
     background: Background
     measurement: MeasurementModel | None = None
@@ -50,29 +47,21 @@ class FitDiagnostics(Record):
 _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
-class FitRecord(Record):
-    """The record of one fit: scans, cost and errors in nm; None for a model without training steps.
-
-    ``at_bounds`` maps each fitted value on a bound of its range to that bound.
-    """
+class FitRecord(FitFacts):
+    """The record of one fit: scans, cost and errors in nm; None for a model without training steps."""
 
     model: str
     fold: int
     key: str
-    training_ids: list[str]
-    validation_ids: list[str]
     held_out_ids: list[str]
-    parameters: int
-    seconds: float
     steps: list[int]
     training_mae_nm: list[float]
     validation_mae_datum_free_nm: list[float | None]
-    at_bounds: dict[str, float] = Field(default_factory=dict)
     diagnostics: FitDiagnostics
 
 
 def fit_or_load(
-    name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool = False
+    name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool
 ) -> tuple[FitRecord, list[np.ndarray]]:
     """Return a fit and its heights (ny, nx) of the held-out scans, µm, from the cache or newly fitted.
 
@@ -133,7 +122,7 @@ def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
 
 
 def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool) -> None:
-    model, chose = fitted.model, fitted.validation_ids
+    model, chose = fitted.model, fitted.facts.validation_ids
     held_out = [predict_scan(model, scan) for scan in fold.held_out]
     own = [predict_scan(model, scan) for scan in progress(fold.training, "predicting")]
 
@@ -145,13 +134,8 @@ def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool
         model=model.name,
         fold=fold.number,
         key=key,
-        training_ids=fitted.training_ids,
-        validation_ids=chose,
         held_out_ids=[scan.id for scan in fold.held_out],
-        parameters=model.parameter_count,
-        seconds=fitted.seconds,
         steps=[entry.step for entry in fitted.history],
-        at_bounds=model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
         diagnostics=FitDiagnostics(
@@ -161,6 +145,7 @@ def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str, measured: bool
             inner_validation_nm=error_nm(True) if chose else None,
             held_out_nm=mean_error_nm(fold.held_out, held_out),
         ),
+        **dict(fitted.facts),
     )
     with atomic_folder(folder) as temporary:
         for number, height in enumerate(held_out):

@@ -10,7 +10,6 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.pictures import LIGHT, model_colour, new_figure
 from litho_data.store import PrintedScan
-from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ModelScores
 
 if TYPE_CHECKING:
@@ -102,12 +101,6 @@ def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
     axes.set(xlabel="x, µm", ylabel="height, µm", xlim=(0, min(x_um[-1], 30)))
     axes.legend(ncols=4, fontsize=8)
     return figure
-
-
-def residual_um(scan: PrintedScan, prediction_um: np.ndarray, protocol: NuisanceProtocol) -> np.ndarray:
-    """Cross-fitted residual of one scan under the protocol, µm."""
-    terms = policy_terms(protocol.policy)
-    return cross_fit(scan.height_um, prediction_um, scan.valid, terms, protocol.blocks).residual_um
 
 
 def level_bias(scores: Sequence[ModelScores]) -> Figure:

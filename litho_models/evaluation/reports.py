@@ -11,6 +11,7 @@ from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.evaluation.wording import benchmark_verdict, evaluation_verdict, said
 from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.metrics import residual_um
 from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
@@ -50,10 +51,10 @@ def write_evaluation_report(
 def write_benchmark_report(
     result: Benchmark,
     scans: Sequence[PrintedScan],
-    predictions_um: Mapping[str, Mapping[str, np.ndarray]],
+    predictions_um: Mapping[str, Sequence[np.ndarray]],
     out: str | Path,
 ) -> Path:
-    """Render the result into ``out``; ``predictions_um`` is model name -> scan id -> height."""
+    """Render the result into ``out``; ``predictions_um``: what each model expects of each scan."""
     scores, split = sorted(result.scores, key=lambda s: -s.leading_nm), result.split
     best = scores[-1]
     page = _page(f"Benchmark on {result.dataset.name}", result, {})
@@ -80,9 +81,9 @@ def write_benchmark_report(
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )
-    middle = scans[int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])]
-    shown = {s.model: predictions_um[s.model][middle.id] for s in scores}
-    _one_scan(page, "The scan of median error", middle, shown, result.nuisance)
+    middle = int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])
+    shown = {s.model: predictions_um[s.model][middle] for s in scores}
+    _one_scan(page, "The scan of median error", scans[middle], shown, result.nuisance)
     page.heading("Training", folded=True)
     page.table(
         result.fits,
@@ -119,7 +120,7 @@ def _one_scan(
     predictions_um: Mapping[str, np.ndarray],
     protocol: NuisanceProtocol,
 ) -> None:
-    residuals = {name: plots.residual_um(scan, own, protocol) for name, own in predictions_um.items()}
+    residuals = {name: residual_um(scan, own, protocol) for name, own in predictions_um.items()}
     page.heading(title, folded=True)
     page.figure(plots.residual_maps(scan, residuals), f"{scan.id}: measured height and error.")
     last = dict(list(residuals.items())[-2:])

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -36,8 +35,8 @@ class ModelRecord(Record):
 class Evaluation(Result):
     """``evaluation.json``."""
 
-    SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
-    FILE_NAME: ClassVar[str] = "evaluation.json"
+    SCHEMA = "litho-models/evaluation/1"
+    FILE_NAME = "evaluation.json"
 
     run: RunInfo
     dataset: DatasetId
@@ -52,8 +51,8 @@ class Evaluation(Result):
 class Benchmark(Result):
     """``benchmark.json``."""
 
-    SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
-    FILE_NAME: ClassVar[str] = "benchmark.json"
+    SCHEMA = "litho-models/benchmark/1"
+    FILE_NAME = "benchmark.json"
 
     run: RunInfo
     dataset: DatasetId
@@ -65,15 +64,6 @@ class Benchmark(Result):
     locked_scores: list[ModelScores] = Field(default_factory=list)
     paired: list[Paired]
     fits: list[FitRecord]
-
-
-@dataclass(frozen=True)
-class ScoredResult:
-    """The facts that two results must share to be compared, and their scores by model."""
-
-    path: Path
-    protocol: dict[str, object]
-    scores: dict[str, ModelScores]
 
 
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
@@ -88,33 +78,28 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     """
     import pandas as pd
 
-    left, right = read_scored(first), read_scored(second)
-    for key, value in left.protocol.items():
-        if right.protocol[key] != value:
+    (protocol, left), (other, right) = _scored(first), _scored(second)
+    for key, value in protocol.items():
+        if other[key] != value:
             raise InputError(
-                f"cannot compare {left.path} with {right.path}: {key} differs",
-                got=f"{_short(value)} and {_short(right.protocol[key])}",
+                f"cannot compare {first} with {second}: {key} differs",
+                got=f"{_short(value)} and {_short(other[key])}",
                 wanted="the same protocol in both",
             )
-    common = [name for name in left.scores if name in right.scores]
-    pairs = [(name, name) for name in common] or [
-        (a, b) for a in left.scores for b in right.scores if len(left.scores) == len(right.scores) == 1
-    ]
+    pairs = [(left[name], right[name]) for name in left if name in right]
+    if len(left) == len(right) == 1:
+        pairs = [*zip(left.values(), right.values(), strict=True)]
     if not pairs:
         raise InputError(
             "models of the two results",
-            got=f"{', '.join(left.scores)} and {', '.join(right.scores)}",
+            got=f"{', '.join(left)} and {', '.join(right)}",
             wanted="at least one in common",
         )
-    return pd.DataFrame([_row(left.scores[a], right.scores[b]) for a, b in pairs])
+    return pd.DataFrame([_row(*pair) for pair in pairs])
 
 
-def read_scored(path: str | Path) -> ScoredResult:
-    """Read a benchmark or an evaluation, from its file or folder.
-
-    Raises:
-        InputError: neither of the two.
-    """
+def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
+    """What a benchmark or an evaluation must share with another to be compared, and its scores by model."""
     file = Path(path)
     if file.is_dir():
         names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]
@@ -130,7 +115,7 @@ def read_scored(path: str | Path) -> ScoredResult:
         "nuisance": result.nuisance.model_dump(),
     }
     scores = result.scores if isinstance(result, Benchmark) else [result.scores]
-    return ScoredResult(file, protocol, {s.model: s for s in scores})
+    return protocol, {s.model: s for s in scores}
 
 
 def _schema(file: Path) -> object:

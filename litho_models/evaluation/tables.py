@@ -9,7 +9,8 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metric_registry import metrics_text, registered_metrics
 from litho_models.scoring.metrics import INDEX_STEP, WAVELENGTH_UM
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import Interval, ModelScores
+from litho_models.scoring.records import ModelScores
+from litho_models.scoring.statistics import Interval
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -48,26 +48,6 @@ class TrainingState:
             self.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.history.append(record)
 
-    def restore_best(self) -> None:
-        """Load the weights of the best round."""
-        self.model.load_state_dict(self.best)
-
-    def save(self, file: Path) -> None:
-        """Write weights, best weights and moments."""
-        buffer = BytesIO()
-        torch.save((self.model.state_dict(), self.best, self.optimiser.state_dict()), buffer)
-        # Not written by torch itself, which raises no OSError on a full disk.
-        file.write_bytes(buffer.getvalue())
-
-    def load(self, file: Path, history: list[RoundRecord]) -> None:
-        """The inverse of ``save``. The file can contain only tensors and numbers, and nothing in it is
-        run.
-        """
-        weights, self.best, moments = torch.load(file, map_location="cpu", weights_only=True)
-        self.model.load_state_dict(weights)
-        self.optimiser.load_state_dict(moments)
-        self.history = list(history)
-
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
@@ -104,8 +84,11 @@ class CheckpointFolder:
 
     def save(self, state: TrainingState) -> None:
         """Replace the checkpoint as a whole."""
+        buffer = BytesIO()
+        torch.save((state.model.state_dict(), state.best, state.optimiser.state_dict()), buffer)
         with atomic_folder(self.path) as folder:
-            state.save(folder / "state.pt")
+            # Not written by torch itself, which raises no OSError on a full disk.
+            (folder / "state.pt").write_bytes(buffer.getvalue())
             record = {"key": self._key, "history": [entry.model_dump() for entry in state.history]}
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
@@ -117,7 +100,12 @@ class CheckpointFolder:
         """
         if self._kept:
             with reading_kept(self.path):
-                state.load(self.path / "state.pt", self._kept)
+                # Tensors and numbers only: nothing in the file is run.
+                kept = torch.load(self.path / "state.pt", map_location="cpu", weights_only=True)
+                weights, state.best, moments = kept
+                state.model.load_state_dict(weights)
+                state.optimiser.load_state_dict(moments)
+                state.history = self._kept
 
     def _kept_history(self) -> list[RoundRecord]:
         file = self.path / "state.json"

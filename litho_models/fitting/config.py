@@ -2,9 +2,10 @@
 
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from litho_data.foundation.errors import require_known
+from litho_data.foundation.results import Record
 from litho_models.scan_terms import Policy
 from litho_models.simulator import Simulator, Variant, is_small
 
@@ -16,20 +17,21 @@ FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # is enough, and no scan is needed to choose between rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # Settings that a fit by least squares depends on.
-LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance", "free_gain"}
+LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance"}
 # Upper limit of all counts. No real case needs more, and larger sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
-class TrainingConfig(BaseModel):
+class TrainingConfig(Record):
     """Settings of one fit. Fits by least squares use only the seed and the nuisances.
 
-    ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), their
-    offset and gain pinned to a mean of zero over the training scans.
+    ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), without the gain, of
+    which a part is the layout's; their offset is pinned to a mean of zero over the training scans.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    FORMER = frozenset({"free_gain"})
+    model_config = ConfigDict(allow_inf_nan=False)
 
     recipe: Recipe = "fast"
     variant: Variant = "default"
@@ -52,9 +54,6 @@ class TrainingConfig(BaseModel):
     learning_rate: float = Field(2e-3, gt=0, le=_MOST)
     weight_decay: float = Field(1e-3, ge=0, le=_MOST)
     nuisance: Policy = "full+rows"
-    free_gain: bool = Field(
-        False, description="a gain per scan among the nuisances, where the policy has one"
-    )
     validation_scans: int = Field(
         2, ge=0, le=_MOST, description="training scans that only choose the checkpoint"
     )

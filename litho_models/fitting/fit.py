@@ -2,15 +2,16 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.printed_scan import scan_sha256
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
@@ -30,55 +31,50 @@ from litho_models.splits.folds import inner_validation
 FIRST_MODEL = "linear"
 
 
-@dataclass(frozen=True)
-class Fitted:
+class FitFacts(Record):
+    """The scans that a model was fitted to and chosen on, its size and cost.
+
+    ``at_bounds`` maps each fitted value on a bound of its range to that bound.
+    """
+
+    parameters: int
+    training_ids: list[str]
+    validation_ids: list[str]
+    seconds: float
+    at_bounds: dict[str, float] = Field(default_factory=dict)
+
+
+class Fitted(NamedTuple):
     """A fitted model and how it was fitted; ``history`` is empty for models without rounds."""
 
     model: Simulator
-    training_ids: list[str]
-    validation_ids: list[str]
+    facts: FitFacts
     history: list[RoundRecord]
-    seconds: float
 
 
-def fit(model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig) -> Simulator:
-    """Fit a model to scans and return it, in eval mode.
+def fit(
+    model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, checkpoint: Path | None = None
+) -> Fitted:
+    """Fit a model to scans; the model is in eval mode.
 
     Args:
         model_name: one of ``litho_models.models.MODELS``.
         scans: scans to learn from, all of one pitch, level height and number of levels.
-        config: recipe, variant, seed, nuisances.
+        config: recipe, variant, seed, nuisances, settings of the model.
+        checkpoint: folder from which a killed run continues.
 
     Raises:
-        InputError: unknown model, no scans, or scans that do not belong together.
-    """
-    return fit_with_record(model_name, scans, config).model
-
-
-def fit_with_record(
-    model_name: str,
-    scans: Sequence[PrintedScan],
-    config: TrainingConfig,
-    *,
-    checkpoint: Path | None = None,
-    model_fields: dict[str, Any] | None = None,
-) -> Fitted:
-    """As ``fit``, with the history; ``checkpoint`` is a folder from which a killed run continues.
-
-    ``model_fields`` override hyper-parameters of the model's variant.
-
-    Raises:
-        InputError: as ``fit``, or a folder that holds another run's checkpoint or a damaged one.
+        InputError: unknown model, no scans, scans that do not belong together, or a folder that holds another
+            run's checkpoint or a damaged one.
     """
     geometry = common_geometry(scans)
     started = time.monotonic()
     torch.manual_seed(config.seed)
-    fields = {**config.model, **(model_fields or {})}
-    for name in geometry.keys() & fields.keys():
+    for name in geometry.keys() & config.model.keys():
         raise InputError(
-            f"setting {name}", got=fields[name], wanted=f"{geometry[name]}, as the scans have it"
+            f"setting {name}", got=config.model[name], wanted=f"{geometry[name]}, as the scans have it"
         )
-    model = build_model(model_name, config.variant, **geometry, **fields)
+    model = build_model(model_name, config.variant, **geometry, **config.model)
     # Checked even if the model writes no checkpoint, because the folder may contain another model's.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
@@ -96,36 +92,37 @@ def fit_with_record(
             model.take(by_steps)
             history.append(fit_feature_networks(model, training, validation, config))
     elif isinstance(model, Features):
-        fit_ridge(model, scans, config.nuisance, config.free_gain)
+        fit_ridge(model, scans, config.nuisance)
     else:
-        fit_small_model(model, scans, config.nuisance, config.free_gain)
-    return Fitted(
-        model=model.eval(),
+        fit_small_model(model, scans, config.nuisance)
+    facts = FitFacts(
+        parameters=model.parameter_count,
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
-        history=history,
         # Includes the time before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
+        at_bounds=model.at_bounds,
     )
+    return Fitted(model.eval(), facts, history)
 
 
 def fit_in_cache(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
 ) -> Fitted:
-    """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
+    """As ``fit``, continued from (and kept in) a folder of ``cache`` named after its key.
 
     A benchmark and a loop that train the same model on the same scans reuse each other's fits there.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
-    return fit_with_record(model_name, scans, config, checkpoint=cache / f"{name}.checkpoint")
+    return fit(model_name, scans, config, cache / f"{name}.checkpoint")
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
     """Heights of a small model fitted to the scans, from which a network's first scan terms come."""
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
-        fit_small_model(small, scans, config.nuisance, config.free_gain)
+        fit_small_model(small, scans, config.nuisance)
     return [predict_scan(small, scan) for scan in scans]
 
 

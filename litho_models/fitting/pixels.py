@@ -47,21 +47,17 @@ def fit_feature_networks(
         scans do not influence the fit.
     """
     started = time.monotonic()
-    terms = smooth_training_terms(config.nuisance, config.free_gain)
+    terms = smooth_training_terms(config.nuisance)
     count = FITTED_PX // len(scans)
     parts = [_pixels(model, scan, terms, count) for scan in progress(scans, "features of pixels")]
     sizes = [network.feature_count for network in model.feature_networks]
-    centre = torch.stack([part.features.mean(dim=0) for part in parts]).mean(dim=0)
-    spread = torch.stack([part.features.var(dim=0) for part in parts]).mean(dim=0).sqrt()
-    scale = torch.where(spread > 1e-6 * spread.max(), spread, 1.0)
-    for network, own, width in zip(
-        model.feature_networks, centre.split(sizes), scale.split(sizes), strict=True
-    ):
-        network.standardise(own, width)
+    seen = zip(*(part.features.T.split(sizes) for part in parts), strict=True)
+    for network, own in zip(model.feature_networks, seen, strict=True):
+        network.standardise(own)
 
     def heights(features: Tensor) -> Tensor:
-        both = zip(model.feature_networks, features.split(sizes, dim=1), strict=True)
-        return torch.stack([network.at_pixels(own.T) for network, own in both]).sum(dim=0)
+        both = zip(model.feature_networks, features.T.split(sizes), strict=True)
+        return torch.stack([network.at_pixels(own) for network, own in both]).sum(dim=0)
 
     features = torch.cat([part.features for part in parts])
     steps = EPOCHS * -(-len(features) // BATCH_PX)

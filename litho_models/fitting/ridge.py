@@ -29,16 +29,17 @@ PASSES = 2
 _TERM_WEIGHT = 1e-3
 
 
-def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False) -> None:
+def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
     """Fit the weights of ``model`` in place to the mean absolute error.
 
     Args:
         model: the model; ``scans``: training scans.
         policy: free terms of each scan, without line offsets, which average out.
     """
-    terms = smooth_training_terms(policy, free_gain)
+    terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):
-        _standardise(model, scans)
+        seen = [feature_rows(model, scan, grid_pixels(scan, FITTED_PX)) for scan in scans]
+        model.standardise([torch.from_numpy(own[: len(model.centre)]) for own in seen])
     solved: FloatMap | None = None
     kept: dict[int, tuple[FloatMap, FloatMap, FloatMap]] = {}
     keeps = 8 * FITTED_PX * model.parameter_count * len(scans) <= KEPT_BYTES
@@ -93,14 +94,3 @@ def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap
         with torch.no_grad():
             found[:, inside] = model.at_pixels(part, own).numpy()
     return found
-
-
-def _standardise(model: RandomFeatures, scans: Sequence[PrintedScan]) -> None:
-    """Standardise the inputs of the random features: mean over all scans, spread within them."""
-    count = len(model.centre)
-    seen = [feature_rows(model, scan, grid_pixels(scan, FITTED_PX))[:count] for scan in scans]
-    centre = np.mean([one.mean(axis=1) for one in seen], axis=0)
-    spread = np.sqrt(np.mean([one.var(axis=1) for one in seen], axis=0))
-    model.standardise(
-        torch.as_tensor(centre), torch.as_tensor(np.where(spread > 1e-6 * spread.max(), spread, 1.0))
-    )

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from litho_data.commands.progress import say
 from litho_data.commands.settings import refused
@@ -17,9 +17,10 @@ from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_data.store.schema import DatasetId
-from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
+from litho_models.fitting.fit import FitFacts
 from litho_models.fitting.processes import joined
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
@@ -32,23 +33,18 @@ from litho_models.simulator import Variant
 CHECKPOINT_FOLDER = "checkpoint"
 
 
-class TrainingRun(Result):
+class TrainingRun(FitFacts, Result):
     """``run.json``: the record of a training."""
 
-    SCHEMA: ClassVar[str] = "litho-models/run/1"
-    FILE_NAME: ClassVar[str] = "run.json"
+    SCHEMA = "litho-models/run/1"
+    FILE_NAME = "run.json"
 
     run: RunInfo
     dataset: DatasetId
     model: str
-    parameters: int
     config: TrainingConfig
-    training_ids: list[str]
-    validation_ids: list[str]
     lock_box: list[str]
     history: list[RoundRecord]
-    seconds: float
-    at_bounds: dict[str, float] = Field(default_factory=dict)
 
 
 def train(
@@ -91,15 +87,11 @@ def train(
     with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
         if first:
             say(f"training {model} on {len(used)} scans")
-        fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
+        fitted = fit(model, used, config, folder / CHECKPOINT_FOLDER)
         record = TrainingRun(
             run=run_info([config.seed], len(used)),
-            parameters=fitted.model.parameter_count,
-            training_ids=fitted.training_ids,
-            validation_ids=fitted.validation_ids,
             history=fitted.history,
-            seconds=fitted.seconds,
-            at_bounds=fitted.model.at_bounds,
+            **dict(fitted.facts),
             **facts,
         )
         if not first:
@@ -112,8 +104,8 @@ def train(
             training={
                 **facts["config"],
                 "scan_ids": [scan.id for scan in used],
-                "validation_ids": fitted.validation_ids,
-                "seconds": round(fitted.seconds, 1),
+                "validation_ids": record.validation_ids,
+                "seconds": round(record.seconds, 1),
             },
             training_level_share=level_share(used),
             training_step_share=step_share(used),

@@ -27,9 +27,7 @@ STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
 
-def fit_small_model(
-    model: Simulator, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False
-) -> list[float]:
+def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Policy) -> list[float]:
     """Fit ``model`` in place to the mean absolute error, on every second row and column of a window per scan.
 
     Line offsets of ``full+rows`` are left out: they average out over a scan and cannot move a small model.
@@ -39,7 +37,7 @@ def fit_small_model(
     """
     if not any(parameter.requires_grad for parameter in model.parameters()):
         return []
-    terms = smooth_training_terms(policy, free_gain)
+    terms = smooth_training_terms(policy)
     rules = replace(RULES, pinned=len(PINNED & terms))
     shown = partial(progress, what=f"fitting {model.name}")
     fitted = fit_least_squares(ModelProblem(model, scans, terms), _vector(model), rules, shown)

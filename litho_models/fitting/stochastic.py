@@ -65,7 +65,7 @@ def train_network(
             continue
         started = time.monotonic()
         predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
-        terms = training_terms(config.nuisance, config.free_gain)
+        terms = training_terms(config.nuisance)
         added = estimate_scan_terms(training, predictions, terms)
         targets = _Targets(training, added, _overhang_px(model, training, config))
         sums = []
@@ -87,7 +87,7 @@ def train_network(
         state.record(record)
         if checkpoints is not None and joined()[0] == 0:
             checkpoints.save(state)
-    state.restore_best()
+    model.load_state_dict(state.best)
     return state.history
 
 

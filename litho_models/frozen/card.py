@@ -1,7 +1,7 @@
 """The card of a frozen model: its use, its origin, and its errors."""
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
@@ -55,14 +55,14 @@ class ModelCard(RunFacts, Result):
     comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each fitted
     value on a bound of its range to that bound. ``baseline``: the figures (``ScanFigures``) of the scans that
     the model was made of, with which ``litho-models check`` compares new prints. ``attributed`` says to which
-    side each effect of undetermined role was attributed when the model was frozen; older cards list those of
-    the printer in ``declared_processes``.
+    side each effect of undetermined role was attributed when the model was frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
 
-    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
-    FILE_NAME: ClassVar[str] = CARD_FILE
+    FORMER = frozenset({"declared_processes", "unexplained_fraction", "fabrication_batch", "optimiser_gap"})
+    SCHEMA = "litho-models/frozen/1"
+    FILE_NAME = CARD_FILE
 
     name: PlainName
     model: str
@@ -89,12 +89,8 @@ class ModelCard(RunFacts, Result):
     process_effects: EffectValues = Field(default_factory=dict)
     measurement_effects: EffectValues = Field(default_factory=dict)
     undetermined_effects: EffectValues = Field(default_factory=dict)
-    declared_processes: list[str] = Field(default_factory=list)
     attributed: dict[str, Attribution] = Field(default_factory=dict)
     confusable_sets: list[list[str]] = Field(default_factory=list)
-    unexplained_fraction: float | None = None
-    fabrication_batch: str = ""
-    optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
 
     @property

@@ -193,8 +193,7 @@ def _check_effects(card: ModelCard) -> None:
 
     for name, values in card.process_effects.items():
         effect = get_effect(name)
-        taken = name in card.declared_processes or card.attributed.get(name) == "printer"
-        if effect.role != "process" and not taken:
+        if effect.role != "process" and card.attributed.get(name) != "printer":
             raise InputError(
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",

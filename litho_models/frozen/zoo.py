@@ -18,24 +18,24 @@ BEST = "best"
 _CARD_FILE = "card.json"
 
 
-def list(root: str | Path = ZOO_FOLDER) -> builtins.list[str]:
+def list() -> builtins.list[str]:
     """Names of the models in the zoo, sorted; empty where none is shipped."""
-    return sorted(card.parent.name for card in Path(root).glob(f"*/{_CARD_FILE}"))
+    return sorted(card.parent.name for card in ZOO_FOLDER.glob(f"*/{_CARD_FILE}"))
 
 
-def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
+def folder(name: str) -> Path:
     """The frozen model of that name, or the best one, for commands that take a folder.
 
     Raises:
         InputError: no such model.
     """
-    known = list(root)
+    known = list()
     if name == BEST and known:
-        name = min(known, key=lambda one: _held_out_nm(one, root))
+        name = min(known, key=_held_out_nm)
     if name not in known:
         names = [*known, BEST] if known else []
         raise unknown_name("zoo model", name, names, "" if known else "`make zoo` trains it")
-    return Path(root) / name
+    return ZOO_FOLDER / name
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
@@ -59,17 +59,17 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
     return Path(source)
 
 
-def card(name: str, root: str | Path = ZOO_FOLDER) -> dict[str, Any]:
+def card(name: str) -> dict[str, Any]:
     """The card of a zoo model as a dictionary, with the keys of ``ModelCard``; the weights are not read.
 
     Raises:
         InputError: no such model.
     """
-    found: dict[str, Any] = json.loads((folder(name, root) / _CARD_FILE).read_text(encoding="utf-8"))
+    found: dict[str, Any] = json.loads((folder(name) / _CARD_FILE).read_text(encoding="utf-8"))
     return found
 
 
-def _held_out_nm(name: str, root: str | Path) -> float:
+def _held_out_nm(name: str) -> float:
     """The first figure of a card: the error on held-out scans."""
-    metrics = card(name, root)["metrics"]
+    metrics = card(name)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")

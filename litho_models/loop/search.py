@@ -267,6 +267,8 @@ def untestable(study: Study) -> dict[str, str]:
             reasons[effect.name] = "every layout has only one level, so nothing in the print varies"
         elif "order" in effect.needs and len({scan.context.order for scan in study.scans}) < 3:
             reasons[effect.name] = "the writing order of the scans is not known"
+        elif "probe" in effect.needs and study.scans[0].stored.seen_by == "confocal":
+            reasons[effect.name] = "a confocal microscope has no probe"
     return reasons
 
 

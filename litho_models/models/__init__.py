@@ -10,7 +10,7 @@ from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
-from litho_models.models.parts import register_part
+from litho_models.models.parts import kernels_part, register_part
 from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
 from litho_models.models.printers import DmdGrayscale, ElectronBeam, LaserWriter, Printer, Projection
@@ -20,6 +20,7 @@ __all__ = [
     "MODELS",
     "build_model",
     "fixed_numbers",
+    "kernels_part",
     "model_class",
     "register_part",
     "register_simulator",

@@ -1,7 +1,5 @@
 """Baselines that every model must beat, from the layout itself to linear features in closed form."""
 
-from typing import ClassVar
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -10,6 +8,8 @@ from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.pixelwise import interpolate
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+
+_MOST_KNOTS = 33
 
 
 class Identity(Simulator):
@@ -45,14 +45,14 @@ class Affine(Simulator):
 
 
 class BlurTableConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigma_max_um", "sigma_init_um")
+    LENGTHS = ("sigma_max_um", "sigma_init_um")
 
     sigma_max_um: float = Field(1.0, gt=0, description="upper bound of the blur, µm")
     sigma_init_um: float = Field(0.25, gt=0, description="blur before fitting, µm")
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), T linear between one free height per level."""
+    """H = T(G_σ * M), T linear between free heights: one per level, or 33 evenly spaced ones."""
 
     name = "blur-table"
     Config = BlurTableConfig
@@ -61,7 +61,8 @@ class BlurTable(Simulator):
     def __init__(self, config: BlurTableConfig):
         super().__init__(config)
         self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_init_um))
-        self.table_um = nn.Parameter(torch.arange(config.levels) * config.level_height_um)
+        knots = min(config.levels, _MOST_KNOTS)
+        self.table_um = nn.Parameter(torch.arange(knots) * (config.full_height_um / (knots - 1)))
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -82,7 +83,7 @@ class BlurTable(Simulator):
 
 
 class AffineMtfConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um",)
+    LENGTHS = ("sigmas_um",)
 
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8), min_length=1)
 
@@ -128,7 +129,7 @@ def blurred_interior(
 
 
 class LinearConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = ("sigmas_um", "power_sigma_um")
+    LENGTHS = ("sigmas_um", "power_sigma_um")
 
     sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0), min_length=1)
     power_sigma_um: float = 0.25

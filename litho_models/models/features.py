@@ -1,6 +1,7 @@
 """Models that are linear in many features of the layout, such as blurs, slopes and products."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from typing import Any, ClassVar
 
@@ -18,7 +19,7 @@ _LEAST_SLOPE = 1e-4
 
 
 class FeaturesConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         *("sigmas_um", "slope_sigmas_um", "shifts_um", "shift_sigma_um"),
         *("streak_sigmas_um", "steep_sigmas_um", "steep_widths_um"),
     )
@@ -36,11 +37,13 @@ class FeaturesConfig(SimulatorConfig):
     steep_widths_um: tuple[float, ...] = Field((), description="widths of these averages, µm")
 
 
-class OfField(ABC):
-    """Common parts of features: blurs, displacements, and their reach."""
+class OfField(nn.Module, ABC):
+    """Common parts of features: blurs, displacements, their reach, and the scale of a network's inputs."""
 
     config: Any
     pitch_um: float
+    centre: Tensor
+    scale: Tensor
 
     @property
     @abstractmethod
@@ -63,6 +66,17 @@ class OfField(ABC):
 
     def _radius(self, *sigmas_um: float) -> int:
         return max((kernel_radius_px(sigma / self.pitch_um) for sigma in sigmas_um), default=0)
+
+    def _register_inputs(self, count: int) -> None:
+        self.register_buffer("centre", torch.zeros(count))
+        self.register_buffer("scale", torch.ones(count))
+
+    def standardise(self, seen: Sequence[Tensor]) -> None:
+        """Scale inputs by those ``seen`` in each scan, (inputs, n): mean over scans, spread within them."""
+        centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
+        spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
+        self.centre.copy_(centre)
+        self.scale.copy_(torch.where(spread > 1e-6 * spread.max(), spread, 1.0))
 
 
 class Features(OfField, Simulator):
@@ -188,8 +202,6 @@ class RandomFeatures(Features):
     config: RandomFeaturesConfig
     directions: Tensor
     thresholds: Tensor
-    centre: Tensor
-    scale: Tensor
 
     def __init__(self, config: RandomFeaturesConfig):
         super().__init__(config)
@@ -199,18 +211,12 @@ class RandomFeatures(Features):
         size = min(config.inputs, count) ** 0.5
         self.register_buffer("directions", torch.randn(config.units, count, generator=random) * seen / size)
         self.register_buffer("thresholds", torch.randn(config.units, generator=random))
-        self.register_buffer("centre", torch.zeros(count))
-        self.register_buffer("scale", torch.ones(count))
+        self._register_inputs(count)
         self.weights = nn.Parameter(torch.cat([self.weights.detach(), torch.zeros(config.units)]))
 
     def completed(self, features: Tensor) -> Tensor:
         standard = (features[: len(self.centre)] - self.centre[:, None]) / self.scale[:, None]
         return torch.cat([features, torch.tanh(self.directions @ standard + self.thresholds[:, None])])
-
-    def standardise(self, centre: Tensor, scale: Tensor) -> None:
-        """Set the mean and standard deviation (simple features,) of the random features' inputs."""
-        self.centre.copy_(centre)
-        self.scale.copy_(scale)
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -6,6 +6,7 @@ whole image, to a local convolution. The operator is periodic in the image and i
 image, so its result depends on the image size. ``default`` therefore runs it on tiles of one size.
 """
 
+import math
 from typing import Any, ClassVar, Self
 
 import torch
@@ -152,22 +153,35 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field (b, y, x, channels); an image smaller than the modes keeps those it has."""
+        """Convolve a field (b, y, x, channels); an image smaller than the modes keeps those it has.
+
+        So few frequencies are kept that products with their waves cost less than fast transforms.
+        """
         ny, nx = field.shape[1:3]
         modes_y, modes_x = self.weight.shape[3:5]
         kept_y, kept_x = min(modes_y, ny // 2), min(modes_x, nx // 2 + 1)
         with torch.autocast(device_type=field.device.type, enabled=False):
-            along_x = torch.fft.rfft(field.to(self.weight.dtype), dim=2)[:, :, :kept_x]
-            spectra = torch.fft.fft(along_x, dim=1)
+            field = field.to(self.weight.dtype)
+            k_y, k_x = torch.arange(-kept_y, kept_y), torch.arange(kept_x)
+            waves_y, waves_x = _waves(k_y, ny, field), _waves(k_x, nx, field)
+            parts_x = torch.cat([waves_x.real, -waves_x.imag])
             positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
-            mixed = torch.zeros_like(spectra)
-            # Rows of a spectrum begin with frequency 0 and end with -1.
-            for rows, matrices in (
-                (slice(kept_y), positive[:, :, :kept_y]),
-                (slice(ny - kept_y, ny), negative[:, :, modes_y - kept_y :]),
-            ):
-                mixed[:, rows] = torch.einsum("byxi,ioyx->byxo", spectra[:, rows], matrices)
-            return torch.fft.irfft(torch.fft.ifft(mixed, dim=1), n=nx, dim=2)
+            matrices = torch.cat([negative[:, :, modes_y - kept_y :], positive[:, :, :kept_y]], dim=2)
+            along_x = torch.complex(*(parts_x @ field).chunk(2, dim=2))
+            spectra = (waves_y.conj() @ along_x.flatten(2)).unflatten(2, (kept_x, -1))
+            mixed = torch.einsum("byxi,ioyx->byxo", spectra, matrices)
+            # A frequency along x stands for its negative too, unless the two are the same.
+            shares = (1 + (2 * k_x % nx).sign()).to(field)[:, None] / (ny * nx)
+            lines = (waves_y.T @ (shares * mixed).flatten(2)).unflatten(2, (kept_x, -1))
+            return parts_x.T @ torch.cat([lines.real, lines.imag], dim=2)
+
+
+def _waves(frequencies: Tensor, size: int, like: Tensor) -> Tensor:
+    """exp(2πi k n / N), (frequencies, N), of the precision and device of ``like``."""
+    # The product is reduced to one period as whole numbers: angles stay exact at any size.
+    turns = torch.outer(frequencies, torch.arange(size)) % size
+    angle = (2 * math.pi / size) * turns.double()
+    return torch.complex(angle.cos().to(like), angle.sin().to(like))
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:

@@ -16,8 +16,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
@@ -52,11 +54,15 @@ def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     """Image of a mask (b, 1, y, x), relative to an open mask, without a border as wide as the kernels."""
     reach = kernel_reach_px(optics, pitch_um)
-    ny, nx = transmission.shape[-2:]
-    spectra = _spectra(optics, pitch_um, 2 * reach + 1, ny, nx).to(transmission.device)
+    spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
+    return imaged_inside(transmission, spectra, reach)
+
+
+def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
+    """``imaged`` of a mask that is not periodic, without its outermost ``reach_px``."""
     # Transforms spread rounding over the field. Double precision keeps tiles equal to the whole field.
-    image = imaged(transmission.double(), spectra)[..., reach : ny - reach, reach : nx - reach]
-    return image.to(transmission.dtype)
+    image = imaged(transmission.double(), spectra.to(transmission.device))
+    return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
 
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
@@ -68,7 +74,7 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
     return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
 
 
-def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> np.ndarray:
+def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> Array:
     """The kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
 
     Source points lie on the grid of the field's frequencies, each weighted by the filled share of its cell.
@@ -98,7 +104,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     return found.reshape(count, *shape)
 
 
-def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics) -> np.ndarray:
+def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
     """Share of the cells (y, x) around frequencies, relative to the pupil, that the source fills."""
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
@@ -109,7 +115,7 @@ def _filled(y: np.ndarray, x: np.ndarray, cell: Sequence[float], optics: Optics)
     return filled / _COUNTED**2
 
 
-def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
+def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
     """Amplitude that passes the pupil, with the phase of a defocus."""
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)
@@ -119,11 +125,17 @@ def _pupil(fy: np.ndarray, fx: np.ndarray, optics: Optics) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Transfer functions (k, ny, nx) of kernels that are no larger than ``size_px``."""
+    """``spectra_of`` the kernels of a lens, no larger than ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
+    return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)
+
+
+def spectra_of(kernels: np.ndarray, ny: int, nx: int) -> Tensor:
+    """Transfer functions (k, ny, nx) of kernels (k, size, size) around their middle pixel."""
+    size_px = kernels.shape[-1]
     reach = size_px // 2
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
-    placed[:, :size_px, :size_px] = np.fft.fftshift(kernels, axes=(-2, -1))
+    placed[:, :size_px, :size_px] = kernels
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
     # An open mask has the intensity 1 for any number of kernels.
     spectra = np.fft.fft2(placed)

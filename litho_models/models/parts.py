@@ -6,16 +6,20 @@ Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError, damaged, require_known
+from litho_data.readers.registry import require_file
 from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.ranges import Range
-from litho_models.models.hopkins import Optics, intensity, kernel_reach_px
+from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
 # Change of the resist between pixels below which no edge exists.
@@ -56,13 +60,11 @@ class Part:
     """A stage of a printer.
 
     Attributes:
-        name, stage: its name, and the stage at which it acts.
         numbers: parameters by name, see ``Number``; ``source``: source of the formula.
         apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
     name: str
-    stage: Literal["illumination", "resist", "diffusion", "transfer"]
     numbers: Mapping[str, Number]
     apply: Apply
     source: str
@@ -153,6 +155,36 @@ def _optics(values: Values) -> Optics:
     return Optics(**{**values, "kernels": int(values["kernels"])})
 
 
+def _shrink(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
+    remaining = values["kappa_min"] + (1 - values["kappa_min"]) * _diffuse(resist, values, pitch_um)
+    return crop_border(resist, spot_radius_px(values["sigma_um"], pitch_um)) * remaining
+
+
+def kernels_part(name: str, file: str | Path) -> Part:
+    """Illumination by the coherent kernels in an NPY file: Σ_k |h_k * M|², 1 for an open mask.
+
+    Args:
+        name: name of the part.
+        file: real or complex (k, size, size) at the layout's pitch, around the middle pixel of an odd size.
+
+    Raises:
+        InputError: no such file, or another array.
+    """
+    with damaged(f"kernels {file}"):
+        kernels = np.load(require_file(file), allow_pickle=False)
+        size_px = kernels.shape[-1]
+        odd = kernels.ndim == 3 and kernels.shape[1] == size_px and size_px % 2
+        if not odd or not np.isfinite(kernels).all():
+            got = f"{kernels.dtype} {kernels.shape}"
+            raise InputError(f"kernels {file}", got=got, wanted="numbers (k, size, size) of an odd size")
+    spectra = lru_cache(maxsize=2)(partial(spectra_of, kernels))
+
+    def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
+        return imaged_inside(pattern, spectra(*pattern.shape[-2:]), size_px // 2)
+
+    return Part(name, {}, apply, Path(file).name, lambda *_: size_px // 2)
+
+
 _SIGMA = {"sigma_um": Number(0.2, "µm")}
 _BACK = {"back_um": Number(0.6, "µm"), "back_share": Number(0.2, upper=0.9)}
 _BETWEEN = {"between_um": Number(0.4, "µm"), "between_share": Number(0.1, upper=0.9)}
@@ -170,7 +202,7 @@ _CHANG = "sum of Gaussians: Chang, J. Vac. Sci. Technol. 12, 1271 (1975)"
 
 
 def _illumination(name: str, numbers: Mapping[str, Number]) -> Part:
-    return Part(name, "illumination", numbers, _by_spots, _CHANG, _spot_reach_px)
+    return Part(name, numbers, _by_spots, _CHANG, _spot_reach_px)
 
 
 PARTS = {
@@ -181,7 +213,6 @@ PARTS = {
         _illumination("three-spots", {**_SIGMA, **_BACK, **_BETWEEN}),
         Part(
             "lens",
-            "illumination",
             _STATED,
             lambda pattern, values, pitch: intensity(pattern, _optics(values), pitch),
             "partially coherent imaging: Hopkins, Proc. R. Soc. A 217, 408 (1953)",
@@ -189,34 +220,29 @@ PARTS = {
         ),
         Part(
             "tanh",
-            "resist",
             _CONTRAST,
             lambda dose, values, pitch: project(dose, values["contrast"], values["threshold"]),
             "projection of Wang et al. 2011, doi:10.1007/s00158-010-0602-y",
         ),
         Part(
             "hill",
-            "resist",
             _CONTRAST,
             lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
             "share that a dose converts, one half at the threshold",
         ),
         Part(
             "contrast-curve",
-            "resist",
             {"contrast": Number(1.5), "clearing": Number(0.9, upper=3.0)},
             lambda dose, values, pitch: contrast_curve(dose, values["contrast"], values["clearing"]),
             "depth by the logarithm of the dose: Mack, Fundamental Principles of Optical Lithography, 2007",
         ),
         Part(
             "inverted",
-            "resist",
             {},
             lambda resist, values, pitch: 1 - resist,
             "a positive resist remains where a negative one is removed; an imprint inverts its master",
         ),
         Part(
-            "diffusion",
             "diffusion",
             {"sigma_um": Number(0.1, "µm")},
             _diffuse,
@@ -224,15 +250,20 @@ PARTS = {
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(
+            "shrinkage",
+            {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
+            _shrink,
+            "less height where less is exposed around: arXiv:2309.17343, parameterized physics model",
+            lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
+        ),
+        Part(
             "etch",
-            "transfer",
             {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
             lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
             "a film that stays under the resist, its edge moved by a bias",
             lambda values, pitch: 1,
         ),
         Part(
-            "transfer",
             "transfer",
             {"selectivity": Number(1.0)},
             lambda resist, values, pitch: values["selectivity"] * resist,

@@ -8,6 +8,7 @@ network (shrinkage), areawise network (everything else).
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self, cast
 
@@ -16,7 +17,8 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.layers.gaussian import Edge, Sigma, Support, gaussian_blur, supported_radius_px
+from litho_data.foundation.errors import require_known
+from litho_models.layers.gaussian import Edge, Support, gaussian_blur, supported_radius_px
 from litho_models.layers.pixelwise import PointwiseNet
 from litho_models.layers.ranges import Range
 from litho_models.models.feature_networks import (
@@ -26,19 +28,22 @@ from litho_models.models.feature_networks import (
     ScanAxisConfig,
     Surroundings,
 )
+from litho_models.models.parts import Part, part_of
 from litho_models.simulator import Simulator, SimulatorConfig, Variant, crop_border, scaled_lengths
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
 
 
 class PblConfig(SimulatorConfig):
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         "sigma_optical_um",
         "sigma_diffusion_max_um",
         "sigma_diffusion_init_um",
     )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
+    illumination: str | None = Field(None, description="part of a printer in place of this spot: lens, …")
+    numbers: dict[str, float] = Field({}, description="values in place of the illumination's own")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
     # Wider than the areawise network sees (0.5 µm), so the blur starts where no other part can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
@@ -89,10 +94,26 @@ class PblConfig(SimulatorConfig):
         }
         return config.model_copy(update=scaled)
 
+    @property
+    def exposing(self) -> Part:
+        """The illumination in place of the spot."""
+        return part_of(self.illumination or "spot")
+
+    @property
+    def exposing_values(self) -> dict[str, float]:
+        """Its values by name."""
+        return {name: self.numbers.get(name, own.start) for name, own in self.exposing.numbers.items()}
+
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
         if self.edge == "zero" and (self.surroundings or self.scan_axis):
             raise ValueError("surroundings and scan_axis take edge 'replicate'")
+        if self.illumination is not None:
+            part = self.exposing
+            for name in self.numbers:
+                require_known(f"number of {part.name}", name, part.numbers)
+            if self.edge == "zero":
+                raise ValueError("illumination takes edge 'replicate'")
         return self
 
 
@@ -188,8 +209,13 @@ class Pbl(Simulator):
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
         """Apply the paper's chain to a field with nothing beyond its edge, or to its interior alone."""
         optical, diffusion = self._radii_px()
-        initial = self._threshold(self._blur(layout_um, self.config.sigma_optical_um, optical, edge))
-        dose = self._blur(initial, self.sigma_diffusion_um, diffusion, edge)
+        blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
+        if self.config.illumination is None:
+            exposed = blur(layout_um, self.config.sigma_optical_um, radius_px=optical)
+        else:
+            exposed = self._exposed(layout_um)
+        initial = self._threshold(exposed)
+        dose = blur(initial, self.sigma_diffusion_um, radius_px=diffusion)
         if edge is None:
             return self._develop(crop_border(initial, diffusion), dose)
         return self._develop(initial, dose, padding=1)
@@ -200,10 +226,13 @@ class Pbl(Simulator):
             supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
             for sigma in (config.sigma_optical_um, diffusion)
         )
+        if config.illumination is not None:
+            optical = config.exposing.reach_px(config.exposing_values, self.pitch_um)
         return optical, diffused
 
-    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
-        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
+    def _exposed(self, layout_um: Tensor) -> Tensor:
+        config, full_um = self.config, self.config.full_height_um
+        return full_um * config.exposing.apply(layout_um / full_um, config.exposing_values, self.pitch_um)
 
     def _threshold(self, aerial: Tensor) -> Tensor:
         full = self.config.full_height_um

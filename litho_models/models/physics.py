@@ -6,20 +6,14 @@ shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model"
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.layers.gaussian import (
-    Edge,
-    Sigma,
-    Support,
-    gaussian_blur,
-    pad_field,
-    supported_radius_px,
-)
+from litho_models.layers.gaussian import Edge, Support, gaussian_blur, pad_field, supported_radius_px
 from litho_models.layers.ranges import Range
 from litho_models.models.parts import project
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
@@ -31,7 +25,7 @@ Spot = Literal["given", "round", "elliptical"]
 class PhysicsConfig(SimulatorConfig):
     """Config of Physics; variants replace some defaults."""
 
-    LENGTHS: ClassVar[tuple[str, ...]] = (
+    LENGTHS = (
         *("sigma_optical_um", "sigma_optical_max_um"),
         *("sigma_diffusion_max_um", "sigma_diffusion_init_um"),
     )
@@ -158,13 +152,12 @@ class Physics(Simulator):
         # Beyond the radius of the optical blur, a continued layout stays constant when blurred.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
-        initial = self._project(self._blur(relative, self._spot_um(values), optical, edge), values)
-        dose = self._blur(initial, values["sigma_diffusion_um"], diffusion, edge)
+        blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
+        aerial = blur(relative, self._spot_um(values), radius_px=optical)
+        initial = project(aerial, values["alpha"], values["eta"])
+        dose = blur(initial, values["sigma_diffusion_um"], radius_px=diffusion)
         initial = crop_border(initial, margin if edge else diffusion)
         return self._develop(initial, crop_border(dose, margin), values)
-
-    def _blur(self, field: Tensor, sigma_um: Sigma, radius_px: int, edge: Edge | None) -> Tensor:
-        return gaussian_blur(field, sigma_um, self.pitch_um, edge=edge, radius_px=radius_px)
 
     # The methods below take the values, computed once per pass: in forward mode every operation is slow.
 
@@ -178,9 +171,6 @@ class Physics(Simulator):
             for sigma in (spot, diffusion)
         )
         return optical, diffused
-
-    def _project(self, aerial: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        return project(aerial, values["alpha"], values["eta"])
 
     def _develop(self, initial: Tensor, dose: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         if self.config.shrinkage == "image-range":

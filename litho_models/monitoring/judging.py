@@ -11,7 +11,15 @@ from litho_models.monitoring.change_point import (
     likeliest_step,
     noticeable_step,
 )
-from litho_models.monitoring.prints import FIGURES, Alarm, Figure, FigureCheck, print_values, spread_of
+from litho_models.monitoring.prints import (
+    FIGURES,
+    Alarm,
+    Figure,
+    FigureCheck,
+    in_order,
+    print_values,
+    spread_of,
+)
 from litho_models.scoring.printer_state import ScanFigures
 
 
@@ -106,13 +114,12 @@ def _judged(
     step, p = likeliest_step(Series(old.values, now.values, *variances))
     noticeable = spread.sd * noticeable_step(*variances, rate)
     allowed = tolerance if tolerance is not None else TOLERANCE_SPREADS * spread.sd
-    values, variance = np.concatenate([old.values, now.values]), np.concatenate(variances)
-    of_reference = np.arange(len(values)) < len(old.values)
+    order = np.arange(len(old.names) + len(now.names))
     if between:
-        names = print_values([*reference, *new], figure).names
-        order = [[*old.names, *now.names].index(name) for name in names]
-        values, variance, of_reference = values[order], variance[order], of_reference[order]
-    trend = forecast(values, variance, of_reference, allowed)
+        names = [*old.names, *now.names]
+        order = np.array([names.index(name) for name in in_order([*reference, *new])])
+    values, variance = np.concatenate([old.values, now.values])[order], np.concatenate(variances)[order]
+    trend = forecast(values, variance, order < len(old.names), allowed)
     return FigureCheck(
         name=figure.name,
         mean=float(np.exp(spread.mean)),

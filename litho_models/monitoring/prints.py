@@ -1,7 +1,7 @@
 """The record ``check.json`` and its figures: one value per print, and their spread between prints."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -83,10 +83,7 @@ class Spread(NamedTuple):
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
     """The prints in printing order, by the first scan of each."""
-    first: dict[str, tuple[int, str]] = {}
-    for row in rows:
-        first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
-    return sorted(first, key=first.__getitem__)
+    return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
@@ -112,11 +109,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     scans, rest = int(prints.counts.sum()), 0.0
     for name, value in zip(prints.names, prints.values, strict=True):
         rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
-    if scans == n:
-        return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
-    within = rest / (scans - n)
+    within = rest / (scans - n) if scans > n else None
     # The variance of the means of prints is that between prints plus the mean part of the scans.
-    between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
+    between = max(sd**2 - (within or 0.0) * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
 
@@ -173,8 +168,8 @@ class Check(Result):
     ``false_alarm_rate``: chance that such a data set from an unchanged printer raises an alarm.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/check/2"
-    FILE_NAME: ClassVar[str] = "check.json"
+    SCHEMA = "litho-models/check/2"
+    FILE_NAME = "check.json"
 
     run: RunInfo
     dataset: DatasetId

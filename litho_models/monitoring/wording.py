@@ -44,19 +44,15 @@ def _sentences(template: str, **values: object) -> list[str]:
     return filled(Path(__file__).with_name(f"{template}.jinja"), watched=WATCHED, **values).splitlines()
 
 
-def optimism(reference: Sequence[ScanFigures], parameters: int) -> float:
-    """Relative bias of the error on a fit's own scans: parameters over independent pixels.
+def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
+    """Whether the reference's errors are too small to compare errors on unseen prints with.
 
-    Neighbours within a correlation length of the residual count once.
+    On a fit's own scans an error is too small by the ratio of parameters to independent pixels. Neighbours
+    within a correlation length of the residual count once.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
-    return parameters / independent if independent else 0.0
-
-
-def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Whether the reference's errors are too small to compare errors on unseen prints with."""
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))
-    return optimism(reference, parameters) > _BEARABLE_OPTIMISM * spread
+    return independent > 0 and parameters > _BEARABLE_OPTIMISM * spread * independent
 
 
 def _other_layouts(reference: Sequence[ScanFigures], new: Sequence[ScanFigures]) -> bool:

@@ -7,17 +7,16 @@ roughness where the layout is flat and model errors are small.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness.texture import FEWEST_LINES
 from litho_data.store import PrintedScan
-from litho_models.noise.residuals import Residuals
+from litho_models.noise.residuals import Pool, Residuals
 from litho_models.noise.texture import Texture, texture
 from litho_models.noise.variance import layout_slope
 from litho_models.scoring.noise_floor import NoiseFloor, floor_of_residuals, freed_by_policy
-from litho_models.scoring.statistics import pixel_interval, rms
+from litho_models.scoring.statistics import Interval, rms
 
 FLAT_SHARE = 0.25
 _FEWEST_PIXELS = 1000
@@ -32,19 +31,17 @@ class FlatLevel(Record):
     level: int
     pixels: int
     sigma_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     mae_nm: float
 
 
-class NoiseBudget(Record):
+# Older results also have the length of correlation.
+class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
     ``flat_texture`` is the texture of the same pixels after policy ``full``, so with line offsets.
     """
-
-    # Older results also have the length of correlation.
-    model_config = ConfigDict(extra="ignore")
 
     model: str
     floor: NoiseFloor
@@ -75,16 +72,13 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
     """The flat pixels of each level that has enough of them."""
-    used = [np.isfinite(own) for own in flat_um]
-    level = np.concatenate([scan.mask_level[use] for scan, use in zip(scans, used, strict=True)])
-    residual = NM_PER_UM * np.concatenate([own[use] for own, use in zip(flat_um, used, strict=True)])
-    owner = np.repeat(np.arange(len(scans)), [int(use.sum()) for use in used])
-    prints = [scan.print_id for scan in scans]
+    pool = Pool(scans, [np.isfinite(own) for own in flat_um])
+    level, residual = pool.of([scan.mask_level for scan in scans]), NM_PER_UM * pool.of(flat_um)
     for value in np.unique(level).tolist():
         mine = level == value
         if mine.sum() < _FEWEST_PIXELS:
             continue
-        interval = pixel_interval(residual[mine] ** 2, owner[mine], prints)
+        interval = pool.interval(residual**2, mine)
         yield FlatLevel(
             level=value,
             pixels=int(mine.sum()),

@@ -1,21 +1,22 @@
 """Test the calibration of a stated spread on prints outside its fit."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.noise.residuals import Residuals
+from litho_models.noise.residuals import Pool, Residuals
 from litho_models.noise.spread_scores import (
     COVERAGE_LEVELS,
     GAUSSIAN,
     Tails,
+    equal_counts,
     normalised_calibration_error,
     sparsification_error,
 )
@@ -29,7 +30,7 @@ from litho_models.noise.variance import (
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scoring.statistics import pixel_interval, rms
+from litho_models.scoring.statistics import Interval, rms
 
 _FOLDS = 5
 # Roughness is correlated over ten pixels and more, so more pixels add no information.
@@ -37,17 +38,14 @@ _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
+
+
 # Older results have further figures: of ensembles, and promises for whole scans.
-_OLDER = ConfigDict(extra="ignore")
-
-
-class ScanCalibration(Record):
+class ScanCalibration(Record, extra="ignore"):
     """One scan: likelihood and CRPS (lower is better), coverage at the levels stated, rms of r/σ.
 
     ``ence`` and ``ause`` are shares, 0 is best (see ``spread_scores``).
     """
-
-    model_config = _OLDER
 
     scan: str
     nll: float
@@ -58,7 +56,7 @@ class ScanCalibration(Record):
     ause: float
 
 
-class Calibration(Record):
+class Calibration(Record, extra="ignore"):
     """A description of the spread, and its calibration on prints outside its fit.
 
     Args:
@@ -66,8 +64,6 @@ class Calibration(Record):
         nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
         pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
     """
-
-    model_config = _OLDER
 
     name: str
     levels: list[float]
@@ -81,13 +77,11 @@ class Calibration(Record):
     ause: float
 
 
-class SigmaBin(Record):
+class SigmaBin(Record, extra="ignore"):
     """Measured and predicted spread, and its coverage, of pixels within one range of one covariate.
 
     Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group.
     """
-
-    model_config = _OLDER
 
     covariate: str
     low: float
@@ -96,21 +90,19 @@ class SigmaBin(Record):
     rms_nm: float
     predicted_nm: float
     coverage_68: float
-    coverage_68_ci95: tuple[float, float] | None
+    coverage_68_ci95: Interval
     coverage_95: float
-    coverage_95_ci95: tuple[float, float] | None
+    coverage_95_ci95: Interval
     ence: float
     ause: float
 
 
-class SpreadAnalysis(Record):
+class SpreadAnalysis(Record, extra="ignore"):
     """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all scans.
 
     ``nuisance``: what the residuals were freed of. ``left_out``: the prints or scans that are left out of
     each fit to judge it.
     """
-
-    model_config = _OLDER
 
     model: str
     held_out: bool
@@ -219,17 +211,11 @@ def _bins(
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
     """Bins of all pixels, of each level, and of equal counts of every other covariate."""
-    used = [np.isfinite(residual) for residual in residuals_nm]
-
-    def pooled(maps: Sequence[Array]) -> Array:
-        return np.concatenate([field[use] for field, use in zip(maps, used, strict=True)])
-
-    residual = pooled(residuals_nm)
-    sigma = pooled([own.tails.sd * own.scale_nm for own in stated])
-    owner = np.repeat(np.arange(len(scans)), [int(use.sum()) for use in used])
-    prints = [scan.print_id for scan in scans]
+    pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
+    residual = pool.of(residuals_nm)
+    sigma = pool.of([own.tails.sd * own.scale_nm for own in stated])
     inside = {
-        share: pooled(
+        share: pool.of(
             [
                 own.tails.covered(r, own.scale_nm, share / 100)
                 for r, own in zip(residuals_nm, stated, strict=True)
@@ -237,13 +223,13 @@ def _bins(
         )
         for share in (68, 95)
     }
-    for covariate, low, high, mine in _groups(scans, places, pooled):
+    for covariate, low, high, mine in _groups(pool, places):
         if not residual[mine].any():
             continue
         coverage: dict[str, Any] = {}
         for share, within in inside.items():
             coverage[f"coverage_{share}"] = float(within[mine].mean())
-            coverage[f"coverage_{share}_ci95"] = pixel_interval(within[mine], owner[mine], prints)
+            coverage[f"coverage_{share}_ci95"] = pool.interval(within, mine)
         yield SigmaBin(
             covariate=covariate,
             low=low,
@@ -257,20 +243,14 @@ def _bins(
         )
 
 
-def _groups(
-    scans: Sequence[PrintedScan],
-    places: Sequence[dict[str, Array]],
-    pooled: Callable[[Sequence[Array]], Array],
-) -> Iterator[tuple[str, float, float, Array]]:
+def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[str, float, float, Array]]:
     """What a group of pixels has in common, from and to which value, and which pixels it has."""
-    level = pooled([scan.mask_level for scan in scans])
+    level = pool.of([scan.mask_level for scan in pool.scans])
     yield "all", 0, 0, np.ones(level.size, bool)
     for one in np.unique(level).tolist():
         yield "level", one, one, level == one
     for name in PLACES[1:]:
-        values = pooled([own[name] for own in places])
-        limits = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-        number = np.searchsorted(limits[1:-1], values, side="right")
+        limits, number = equal_counts(pool.of([own[name] for own in places]), _BINS)
         for at, (low, high) in enumerate(pairwise(limits.tolist())):
             yield name, low, high, number == at
 

@@ -7,8 +7,8 @@ with a dose, of step ladders or any layout with areas of one level wider than th
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import ConfigDict
 
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
@@ -34,7 +34,7 @@ class LevelHeight(Record):
     pixels: int
 
 
-class DoseRow(Record):
+class DoseRow(Record, extra="ignore"):
     """One dose.
 
     Args:
@@ -47,8 +47,6 @@ class DoseRow(Record):
             more reacts). Relative to the dose's own steps, so that shrinkage does not count as exposure.
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     dose: float
     scans: list[str]
@@ -133,7 +131,7 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     """Per level mean and sd inside areas of one level; datum, tilt and surroundings of each scan removed."""
-    found: dict[int, list[np.ndarray]] = {}
+    found: dict[int, list[Array]] = {}
     for scan in scans:
         inside = _plateaus(scan)
         if not inside.any():
@@ -163,12 +161,12 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     ]
 
 
-def _surroundings(scan: PrintedScan) -> np.ndarray:
+def _surroundings(scan: PrintedScan) -> Array:
     """Mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx) µm."""
     return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 
 
-def _plateaus(scan: PrintedScan) -> np.ndarray:
+def _plateaus(scan: PrintedScan) -> Array:
     """Measured pixels (ny, nx) away from all changes of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -177,12 +175,12 @@ def _plateaus(scan: PrintedScan) -> np.ndarray:
     return even & scan.usable
 
 
-def _run_length(flags: np.ndarray) -> int:
+def _run_length(flags: Array) -> int:
     """Number of leading True values."""
     return int(np.argmin(flags)) if not flags.all() else len(flags)
 
 
-def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
+def _pooled_sd(parts: Sequence[Array]) -> float:
     """Standard deviation within parts, each about its own mean; 0 where no part has two values."""
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from pydantic import Field
@@ -20,7 +21,7 @@ from litho_models.noise.surface import (
     without_background,
 )
 from litho_models.noise.texture import Texture, texture
-from litho_models.scoring.statistics import interval, rms
+from litho_models.scoring.statistics import Interval, interval, rms
 
 _SQUARE_WITHIN = 0.01
 # Pixels that two prints of one layout must have in common.
@@ -111,7 +112,7 @@ class RepeatedPrints(Record):
     """
 
     sigma_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     mae_nm: float
     scans: int
 
@@ -126,18 +127,15 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     for scan in scans:
         groups.setdefault((scan.shape, scan.dose, scan.mask_level.tobytes()), []).append(scan)
     sigmas, absolute, members = [], [], set()
-    for group in groups.values():
-        for number, first in enumerate(group):
-            for second in group[number + 1 :]:
-                both = first.valid & second.valid
-                difference = np.where(both, first.height_um - second.height_um, np.nan)
-                if np.isfinite(difference).sum() < _FEWEST_PIXELS:
-                    continue
-                rest = NM_PER_UM * without_background(difference, "quadratic")
-                rest = rest[np.isfinite(rest)] / np.sqrt(2)
-                sigmas.append(rms(rest))
-                absolute.append(float(np.abs(rest).mean()))
-                members |= {first.id, second.id}
+    for first, second in (pair for group in groups.values() for pair in combinations(group, 2)):
+        difference = np.where(first.valid & second.valid, first.height_um - second.height_um, np.nan)
+        if np.isfinite(difference).sum() < _FEWEST_PIXELS:
+            continue
+        rest = NM_PER_UM * without_background(difference, "quadratic")
+        rest = rest[np.isfinite(rest)] / np.sqrt(2)
+        sigmas.append(rms(rest))
+        absolute.append(float(np.abs(rest).mean()))
+        members |= {first.id, second.id}
     if not sigmas:
         return None
     return RepeatedPrints(

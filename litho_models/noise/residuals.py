@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
@@ -14,8 +16,10 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
-from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
+from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.metrics import residual_um
 from litho_models.scoring.records import Prediction
+from litho_models.scoring.statistics import Interval, pixel_interval
 
 
 class Residuals(NamedTuple):
@@ -33,6 +37,22 @@ class Residuals(NamedTuple):
     residuals_nm: Sequence[Array]
     held_out: bool
     protocol: NuisanceProtocol = NuisanceProtocol()
+
+
+class Pool(NamedTuple):
+    """Pixels of several scans, one scan after the other; ``used``: bool maps (ny, nx) of the pixels."""
+
+    scans: Sequence[PrintedScan]
+    used: Sequence[Array]
+
+    def of(self, maps: Sequence[Array]) -> Array:
+        """The values of one map per scan at the pixels, (n,)."""
+        return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
+
+    def interval(self, values: Array, mine: Array) -> Interval:
+        """Interval over prints of the mean of values (n,) at the chosen pixels."""
+        owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
+        return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
@@ -63,11 +83,7 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
     found = [maps[scan.id] for scan in scans]
-    terms = policy_terms(protocol.policy)
-    residuals = [
-        NM_PER_UM * cross_fit(scan.height_um, own, scan.valid, terms, protocol.blocks).residual_um
-        for scan, own in zip(scans, found, strict=True)
-    ]
+    residuals = [NM_PER_UM * residual_um(scan, own, protocol) for scan, own in zip(scans, found, strict=True)]
     return Residuals(name, scans, found, residuals, held_out, protocol)
 
 

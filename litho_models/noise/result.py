@@ -1,9 +1,6 @@
 """``noise.json``: everything known about the noise of a dataset, and the floor that follows."""
 
-from typing import ClassVar
-
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
@@ -16,13 +13,11 @@ from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 from litho_models.scoring.statistics import rms
 
 
-class NoiseAnalysis(Result):
+class NoiseAnalysis(Result, extra="ignore"):
     """``noise.json``."""
 
-    model_config = ConfigDict(extra="ignore")
-
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = "noise.json"
+    SCHEMA = "litho-models/noise/1"
+    FILE_NAME = "noise.json"
 
     run: RunInfo
     dataset: DatasetId | None

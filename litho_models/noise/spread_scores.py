@@ -78,12 +78,17 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     Args:
         residual, sigma: (pixels,), one unit.
     """
-    limits = np.unique(np.quantile(sigma, np.linspace(0, 1, _BINS + 1)))
-    number = np.searchsorted(limits[1:-1], sigma, side="right")
+    number = equal_counts(sigma, _BINS)[1]
     count = np.bincount(number)
     used = count > 0
     stated, there = (np.sqrt(np.bincount(number, part**2)[used] / count[used]) for part in (sigma, residual))
     return float(np.mean(np.abs(stated - there) / stated))
+
+
+def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
+    """Limits of bins of equal counts, fewer where values repeat, and the bin of each value."""
+    limits = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    return limits, np.searchsorted(limits[1:-1], values, side="right")
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:

@@ -3,7 +3,6 @@
 from itertools import pairwise
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -12,6 +11,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
 from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
+from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
@@ -23,15 +23,13 @@ _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
 
-class Step(Record):
+class Step(Record, extra="ignore"):
     """One step of a staircase, nm.
 
     Args:
         readability: height over the σ of single pixels on its two treads.
         misread: share of the pixels of both treads nearer to the other one.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     height_nm: float
     uncertainty_nm: float
@@ -40,7 +38,7 @@ class Step(Record):
     misread: float
 
 
-class StepPrint(Record):
+class StepPrint(Record, extra="ignore"):
     """A print of steps.
 
     Args:
@@ -48,8 +46,6 @@ class StepPrint(Record):
         tread_mae_nm: mean absolute deviation from the median of each tread.
         resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     id: str
     axis: Axis
@@ -166,18 +162,15 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
     """Columns of each tread without a guard at its edges, which is at most a third of its width."""
-    limits = [0, *edges_px, shape[1]]
-    treads = []
-    for start, stop in pairwise(limits):
-        inset = min(guard_px, (stop - start) // 3)
-        treads.append(slice(start + inset, stop - inset))
-    return treads
+    ends = pairwise([0, *edges_px, shape[1]])
+    insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]
+    return [slice(start + inset, stop - inset) for start, stop, inset in insets]
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
     """Heights without the common tilt of all treads; NaN outside the treads."""
     ny, nx = height_um.shape
-    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    x, y = smooth_shapes((ny, nx))[:2]
     terms = [np.zeros((ny, nx)) for _ in treads]
     inside = np.zeros((ny, nx), bool)
     for term, tread in zip(terms, treads, strict=True):

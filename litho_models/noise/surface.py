@@ -4,18 +4,23 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.roughness import amplitude_parameters, effective_samples
+from litho_data.roughness import effective_samples
+from litho_models.scan_terms import Terms
+from litho_models.scan_terms.cross_fit import fitted_terms
+from litho_models.scoring.statistics import rms
 
 Background = Literal["offset", "quadratic"]
-BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
+BACKGROUNDS: dict[Background, Terms] = {
+    "offset": frozenset({"offset"}),
+    "quadratic": frozenset({"offset", "bow"}),
+}
 
 
-class SurfaceNoise(Record):
+class SurfaceNoise(Record, extra="ignore"):
     """Deviation of a surface from its background.
 
     Args:
@@ -26,8 +31,6 @@ class SurfaceNoise(Record):
         independent_heights: pixels over the sum of squared autocorrelation.
     """
 
-    model_config = ConfigDict(extra="ignore")
-
     id: str
     background: Background
     sigma_nm: float
@@ -37,13 +40,11 @@ class SurfaceNoise(Record):
     pixels: int
 
 
-class PrintNoise(Record):
+class PrintNoise(Record, extra="ignore"):
     """Roughness of the print alone: ``print² = flat² − substrate²``, nm.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     background: Background
     print_nm: float | None
@@ -65,7 +66,7 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
     finite = np.isfinite(deviation)
     if finite.sum() < 64:
         raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
-    sigma = amplitude_parameters(deviation).sq_nm
+    sigma = NM_PER_UM * rms(deviation[finite])
     # Unmeasured pixels have no information, so they enter the correlation as the mean.
     filled = np.where(finite, deviation, deviation[finite].mean())
     independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
@@ -83,14 +84,8 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
 
 def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
     """Height minus its least-squares background over the measured pixels, float64 (ny, nx) µm."""
-    height = np.asarray(height_um, np.float64)
-    finite = np.isfinite(height)
-    if background == "offset":
-        return height - height[finite].mean()
-    y, x = np.meshgrid(*(np.linspace(-1, 1, size) for size in height.shape), indexing="ij")
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    weights, *_ = np.linalg.lstsq(terms[:, finite].T, height[finite], rcond=None)
-    return height - np.tensordot(weights, terms, axes=1)
+    level = np.zeros(height_um.shape)
+    return height_um - fitted_terms(height_um, level, np.isfinite(height_um), BACKGROUNDS[background])[1]
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:

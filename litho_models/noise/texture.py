@@ -4,9 +4,9 @@ The paper calls the roughness of its flat print line-shaped and not periodic (ar
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
-from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
@@ -15,7 +15,7 @@ from litho_data.roughness import line_direction, line_period
 RARE = 1e-3
 
 
-class Period(Record):
+class Period(Record, extra="ignore"):
     """A period of lines.
 
     Args:
@@ -25,8 +25,6 @@ class Period(Record):
         amplitude_nm: root mean square over the surfaces.
         coherence: 1 if the surfaces have one phase, in the frame that they are given in.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     period_um: float
     share: float
@@ -106,13 +104,7 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
     shares = [own.var() / all_of_it for own, all_of_it in zip(means, variances, strict=True) if all_of_it > 0]
     period = None
     if found := line_period(means, pitch_um):
-        period = Period(
-            period_um=found.period_um,
-            share=found.share,
-            p=found.p,
-            amplitude_nm=NM_PER_UM * found.amplitude_um,
-            coherence=found.coherence,
-        )
+        period = Period(**asdict(found), amplitude_nm=NM_PER_UM * found.amplitude_um)
     return Lines(along=along, share=float(np.mean(shares)) if shares else 0.0, period=period)
 
 

@@ -74,7 +74,7 @@ def schedule(
         for at, (use, level) in enumerate(references.items(), start=1)
     ]
     for number, one in enumerate(planned, start=1):
-        level = one.level.numpy().astype(np.uint8)
+        level = one.level.numpy().astype(np.min_scalar_type(limits.highest))
         weaker = f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
         for at, way in enumerate(one.ways, start=1):
             why = WORDS.get(way, "as the prints so far") + weaker

@@ -61,9 +61,10 @@ class Limits:
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
-        """Round to the levels for the printer, uint8."""
+        """Round to the levels for the printer."""
         span = self.highest - self.lowest
-        return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
+        above = quantise((soft - self.lowest) / span, span + 1)
+        return above.astype(np.min_scalar_type(self.highest)) + self.lowest
 
     def price(self, soft: Tensor) -> Tensor:
         """Penalty for levels whose mean or spread is far from that of earlier prints."""
@@ -82,7 +83,7 @@ class Limits:
             pitch_um=self.pitch_um,
             seed=seed,
         )
-        return np.maximum(level, np.uint8(self.lowest))
+        return np.maximum(level, self.lowest)
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:

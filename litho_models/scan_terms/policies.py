@@ -85,18 +85,18 @@ class NuisanceProtocol(Record):
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
-def training_terms(policy: Policy, free_gain: bool = False) -> Terms:
-    """The terms of a policy that are fitted together with a model: all, except the gain unless it is free.
+def training_terms(policy: Policy) -> Terms:
+    """The terms of a policy that are fitted together with a model: all except the gain.
 
     Part of a scan's gain is a long-range effect of the layout, which a model cannot learn if every scan has a
     free gain.
     """
-    return policy_terms(policy) - (frozenset() if free_gain else {"gain"})
+    return policy_terms(policy) - {"gain"}
 
 
-def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
+def smooth_training_terms(policy: Policy) -> Terms:
     """The same without line offsets, which average out over a scan and hardly change a small model."""
-    terms = training_terms(policy, free_gain)
+    terms = training_terms(policy)
     return terms - {term.name for term in line_terms(terms)}
 
 

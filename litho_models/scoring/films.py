@@ -68,8 +68,10 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
     both = (labels[0] > 0) & (labels[1] > 0)
     pairs = np.unique(np.stack([one[both] for one in labels]), axis=1) - 1
     real = large[0][pairs[0]] & large[1][pairs[1]]
-    touched = [np.bincount(own, minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
-    counted = [np.bincount(own[real], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
+    touched, counted = (
+        [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
+        for kept in (slice(None), real)
+    )
     # A part that touches only small parts has a partner but merges nothing.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)

@@ -37,17 +37,17 @@ class Metric(NamedTuple):
 class Measurement(NamedTuple):
     """Metrics that one function returns, in this order, with a sentence that explains them.
 
-    ``instrument``: kind of instrument whose scans have them; empty: all kinds.
+    ``of_films``: whether only films have them, or only heights; None: all scans.
     """
 
     metrics: tuple[Metric, ...]
     function: Callable[[PrintedScan, Array, Array], Sequence[float | None]]
     explanation: str
-    instrument: str = ""
+    of_films: bool | None = None
 
 
 _MEASUREMENTS = [
-    Measurement((Metric("ssim", "1"),), lambda *scan: (similarity_of_scan(*scan),), SIMILARITY_TEXT, "afm"),
+    Measurement((Metric("ssim", "1"),), lambda *scan: (similarity_of_scan(*scan),), SIMILARITY_TEXT, False),
     Measurement(
         (
             Metric("edge_mean", "nm"),
@@ -66,7 +66,7 @@ _MEASUREMENTS = [
         ),
         films_of_scan,
         FILMS_TEXT,
-        "sem",
+        True,
     ),
 ]
 
@@ -127,7 +127,7 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
     """
     values: dict[str, float | None] = {}
     for measurement in _MEASUREMENTS:
-        if measurement.instrument not in ("", scan.seen_by):
+        if measurement.of_films not in (None, scan.seen_by == "sem"):
             continue
         found = measurement.function(scan, prediction_um, residual_um)
         values |= {m.key: _number(m, value) for m, value in zip(measurement.metrics, found, strict=True)}

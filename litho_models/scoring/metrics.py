@@ -9,7 +9,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scan_terms import POLICIES, Blocks, CrossFit, cross_fit
+from litho_models.scan_terms import Blocks, CrossFit, NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
@@ -82,13 +82,17 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
     )
 
 
+def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtocol) -> Array:
+    """Measured minus expected map of a scan, (ny, nx) µm, without its own terms; NaN where not scored."""
+    terms = policy_terms(protocol.policy)
+    return cross_fit(scan.height_um, expected_um, scan.valid, terms, protocol.blocks).residual_um
+
+
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
     """Mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
-    fits = (
-        cross_fit(scan.height_um, height, scan.valid, POLICIES["offset"])
-        for scan, height in zip(scans, heights_um, strict=True)
-    )
-    return NM_PER_UM * float(np.mean([np.nanmean(np.abs(fit.residual_um)) for fit in fits]))
+    protocol = NuisanceProtocol()
+    residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))
+    return NM_PER_UM * float(np.mean([np.nanmean(np.abs(residual)) for residual in residuals]))
 
 
 def phase_waves(height_error_um: float) -> float:

@@ -6,10 +6,10 @@ residuals of a model, by comparing pixels with similar surroundings (``like_layo
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
@@ -18,7 +18,7 @@ from litho_data.store import PrintedScan
 from litho_data.store.schema import DatasetId
 from litho_models.scan_terms import POLICIES, Blocks, CrossFit, Policy, cross_fit
 from litho_models.scoring.like_layouts import LikePixels, like_pixels
-from litho_models.scoring.statistics import pixel_interval
+from litho_models.scoring.statistics import Interval, pixel_interval
 
 NOISE_FILE = "noise.json"
 
@@ -33,9 +33,9 @@ class PolicyFloor(Record):
     policy: Policy
     k: float
     mae_nm: float
-    mae_ci95_nm: tuple[float, float] | None
+    mae_ci95_nm: Interval
     rmse_nm: float
-    rmse_ci95_nm: tuple[float, float] | None
+    rmse_ci95_nm: Interval
 
 
 class NoiseFloor(Record):
@@ -70,13 +70,11 @@ UNKNOWN_FLOOR = NoiseFloor(
 )
 
 
-class _StatedFloor(Result):
+class _StatedFloor(Result, extra="ignore"):
     """The parts of a noise analysis that this module reads: its dataset and the floor."""
 
-    model_config = ConfigDict(extra="ignore")
-
-    SCHEMA: ClassVar[str] = "litho-models/noise/1"
-    FILE_NAME: ClassVar[str] = NOISE_FILE
+    SCHEMA = "litho-models/noise/1"
+    FILE_NAME = NOISE_FILE
 
     dataset: DatasetId | None
     noise_floor: NoiseFloor

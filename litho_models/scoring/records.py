@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
@@ -16,11 +16,11 @@ from litho_data.store.schema import Instrument
 from litho_models.scan_terms import Policy
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.measurement import MeasurementModel
-from litho_models.scoring.statistics import OverUnits, over_prints, over_units
+from litho_models.scoring.statistics import Interval, OverUnits, over_prints, over_units
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
-Interval = tuple[float, float] | None
-LEADING: dict[Instrument, str] = {"afm": "mae_datum_free_nm", "sem": "edge_mean_nm"}
+LEADING: dict[Instrument, str] = dict.fromkeys(get_args(Instrument), "mae_datum_free_nm")
+LEADING["sem"] = "edge_mean_nm"
 """The error by which models are ranked and compared, by the instrument."""
 
 
@@ -76,16 +76,14 @@ class MetricValues(Record):
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-class ScanErrors(Record):
+# Older results also have the error of the intercept.
+class ScanErrors(Record, extra="ignore"):
     """Error of one model on one scan over the scored pixels.
 
     ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free`` terms
     fitted on other pixels are removed. Slope and intercept are the gain and offset of the print against the
     prediction (``print_gain``).
     """
-
-    # Older results also have the error of the intercept.
-    model_config = ConfigDict(extra="ignore")
 
     pixels: int
     mae_abs_nm: float
@@ -106,16 +104,14 @@ class ScanRow(MetricValues, ScanErrors):
     print: str
 
 
-class ModelScores(MetricValues):
+# Older results also have the spread of line offsets.
+class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model: means over scans, sums of counts, and intervals from resampled scans.
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
     have no smooth terms themselves; it is empty where the protocol has no background. ``phase_rms_waves`` is
     the RMS phase error of light that passes the print.
     """
-
-    # Older results also have the spread of line offsets.
-    model_config = ConfigDict(extra="ignore")
 
     model: str
     scans: list[ScanRow]
@@ -163,7 +159,7 @@ class Paired(Record):
     first: str
     second: str
     mean_nm: float
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     p: float
     first_better: int
     scans: int

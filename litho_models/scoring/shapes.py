@@ -8,20 +8,17 @@ of the error.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scoring.films import film_edge_um
 
-FloatMap = NDArray[np.float64]
-
 SSIM_RANGE_UM = 1.2
 SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
-_CANDIDATES = 8
+_CANDIDATES, _MOST_HEIGHTS = 8, 24
 # Half the longest piece of a contour, the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
@@ -51,8 +48,8 @@ class EdgePlacement(NamedTuple):
 
 
 class _Contour(NamedTuple):
-    start: FloatMap  # (n, 2) row, column, px
-    along: FloatMap  # (n, 2), the higher side always on the same hand
+    start: Array  # (n, 2) row, column, px
+    along: Array  # (n, 2), the higher side always on the same hand
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
@@ -133,9 +130,10 @@ def edge_placement(
     )
 
 
-def mid_step_heights_um(levels: int, level_height_um: float) -> FloatMap:
-    """Heights half way between neighbouring nominal levels, (levels - 1,) µm."""
-    return np.arange(0.5, levels - 1, dtype=np.float64) * level_height_um
+def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
+    """Heights half way between neighbouring nominal levels, µm; of many levels 24 evenly spaced ones."""
+    steps = min(levels - 1, _MOST_HEIGHTS)
+    return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)
 
 
 def _contour(map_um: Array, height_um: float) -> _Contour:
@@ -148,7 +146,7 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
     return _Contour(start[real], along[real])
 
 
-def _distance_px(of: _Contour, to: _Contour, search_px: float) -> FloatMap:
+def _distance_px(of: _Contour, to: _Contour, search_px: float) -> Array:
     """Distance of the middle of each piece from the nearest piece that rises to the same side, else inf."""
     from scipy.spatial import KDTree
 

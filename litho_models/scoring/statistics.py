@@ -10,6 +10,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
+# None with fewer than ``FEWEST_FOR_INTERVAL`` units.
+Interval = tuple[float, float] | None
 # Fewest units for p below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
@@ -49,7 +51,7 @@ def bootstrap_interval(
     return _resampled(sums, counts, draws, seed)
 
 
-def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> tuple[float, float] | None:
+def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
     """Interval of a mean over pixels, resampling prints, of which each counts with its pixels.
 
     None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
@@ -82,7 +84,7 @@ def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Arr
     return np.bincount(members, sample), np.bincount(members).astype(np.float64)
 
 
-def interval(values: Sequence[float]) -> tuple[float, float] | None:
+def interval(values: Sequence[float]) -> Interval:
     """As ``bootstrap_interval``, for results: None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
@@ -118,7 +120,7 @@ class OverUnits(Record):
 
     count: int
     positive: int
-    ci95_nm: tuple[float, float] | None
+    ci95_nm: Interval
     p: float
     smallest_p: float
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
@@ -25,13 +25,11 @@ class LevelError(Record):
     sd_nm: float
 
 
-class TransferCurves(Record):
+class TransferCurves(Record, extra="ignore"):
     """Prediction against measurement per frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
 
     ``error_psd``: one-sided density of the error's power along lines, nm² per cycle/µm, line means removed.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     frequency_per_um: list[float]
     gain_x: list[float]
@@ -50,19 +48,15 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
     """
     levels = np.concatenate([s.mask_level[np.isfinite(r)] for s, r in zip(scans, residuals_um, strict=True)])
     errors = np.concatenate([r[np.isfinite(r)] for r in residuals_um]) * NM_PER_UM
-    rows = []
-    for level in np.unique(levels):
-        here = errors[levels == level]
-        rows.append(
-            LevelError(
-                level=int(level),
-                pixels=int(here.size),
-                scans=sum(bool((scan.mask_level == level).any()) for scan in scans),
-                bias_nm=float(here.mean()),
-                sd_nm=float(here.std()),
-            )
-        )
-    return rows
+    values, at, pixels = np.unique(levels, return_inverse=True, return_counts=True)
+    bias = np.bincount(at, errors) / pixels
+    sd = np.sqrt(np.bincount(at, (errors - bias[at]) ** 2) / pixels)
+    seen = np.sum([np.isin(values, scan.mask_level) for scan in scans], axis=0)
+    columns = (one.tolist() for one in (values, pixels, seen, bias, sd))
+    return [
+        LevelError(level=level, pixels=count, scans=among, bias_nm=mean, sd_nm=spread)
+        for level, count, among, mean, spread in zip(*columns, strict=True)
+    ]
 
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:

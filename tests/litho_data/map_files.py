@@ -313,26 +313,6 @@ def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     one.mark, one.says_size = None, True
 
 
-def sxm(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Nanonis: both directions of two signals, scanned up or down, NaN where the scan was stopped."""
-    ny, nx = one.height_um.shape
-    way = "up" if rng.random() < 0.5 else "down"
-    size_m = f"{nx * one.pitch_um * 1e-6!r} {ny * one.pitch_um * 1e-6!r}"
-    sections = {
-        "NANONIS_VERSION": "2", "SCANIT_TYPE": "FLOAT            MSBFIRST",
-        "SCAN_PIXELS": f"       {nx}       {ny}",
-        "SCAN_RANGE": size_m, "SCAN_DIR": way,
-        "DATA_INFO": "\tChannel\tName\tUnit\tDirection\tCalibration\tOffset\n"
-                     "\t14\tZ\tm\tboth\t-1E-8\t0E+0\n\t0\tCurrent\tA\tboth\t1E-9\t0E+0\n",
-    }  # fmt: skip
-    head = "".join(f":{key}:\n{value}\n" for key, value in sections.items()) + ":SCANIT_END:\n\n\n"
-    rows = (one.height_um * 1e-6)[:: -1 if way == "up" else 1]
-    images = np.stack([rows, 2 * rows[:, ::-1], 0 * rows, 0 * rows])
-    path.write_bytes(head.encode() + b"\x1a\x04" + images.astype(">f4").tobytes())
-    one.mark, one.says_size, one.atol_um = None, True, 1e-6
-    one.needs(channel="Z")
-
-
 def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """Digital Surf, as it is or compressed in two streams."""
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
@@ -432,5 +412,5 @@ def numpy_archive(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 WRITERS: tuple[Writer, ...] = (
     text, text, text, text_of_two_channels, axes, axes, frame, points, surfer, esri, wyko, tiff, tiff, hdf5,
-    netcdf, matlab, nhf, sxm, digital_surf, park, sdf, bcr, gsf, numpy_archive,
+    netcdf, matlab, nhf, digital_surf, park, sdf, bcr, gsf, numpy_archive,
 )  # fmt: skip

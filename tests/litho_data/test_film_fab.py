@@ -12,7 +12,15 @@ import pytest
 from litho_data import build_dataset, open_store
 from litho_data.cli.app import main
 from litho_data.foundation.errors import InputError
-from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, edge_distance_px, film_knobs, micrograph
+from litho_data.readers import read_layout
+from litho_data.virtual_fab.films import (
+    FILM_PRINTERS,
+    FilmKnobs,
+    edge_distance_px,
+    film_knobs,
+    micrograph,
+    simulate_films,
+)
 
 BEAM, LENS = FILM_PRINTERS["e-beam"], FILM_PRINTERS["projection"]
 PLAIN = FilmKnobs()
@@ -79,6 +87,19 @@ def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
         off = np.abs(scan.height_um / BEAM.film_um - share)[scan.usable]
         assert off.mean() < 0.05
         assert scan.usable.mean() > 0.8
+
+
+def test_a_field_lies_alone_on_bare_ground(tmp_path: Path) -> None:
+    knobs = FilmKnobs(backscatter=0.6, backscatter_um=0.08)
+    simulate_films(tmp_path / "fab", "e-beam", count=1, size_px=96, knobs=knobs)
+    level = read_layout(tmp_path / "fab" / "raw" / "layouts" / "F00.tif")
+    assert not level[:12].any()
+    assert level.any()
+    wide = edge_distance_px(np.pad(level, 200), BEAM, knobs)[800:-800, 800:-800]
+    # Places are a quarter of a pixel apart; a wider canvas moves edges by no more than one.
+    assert np.abs(wide - np.load(tmp_path / "fab" / "truth" / "F00.npy")).max() < 0.3
+    # In a field that repeats itself more electrons come back, so more stays.
+    assert (edge_distance_px(level, BEAM, knobs) > 0).sum() > 1.05 * (wide > 0).sum()
 
 
 def test_knobs_that_there_are_not_are_refused() -> None:

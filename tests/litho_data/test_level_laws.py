@@ -20,7 +20,6 @@ from litho_data.level import (
     level_plane,
     level_polynomial,
     level_robust,
-    level_three_point,
     mask_and_relevel,
     zero_max,
     zero_mean,
@@ -76,13 +75,11 @@ def test_a_plane_is_removed_in_closed_form(
     atol = ROUNDING * max(np.abs(z).max(), 1e-30)
     # The pivot (nx/2, ny/2) lies half a pixel off the middle pixel, so the mean moves by (bx + by) / 2.
     pivot = constant + slope_x * shape[1] / 2 + slope_y * shape[0] / 2
-    for levelled in (level_plane(z), level_three_point(z, points_px=[(0, 0), (0, 7), (7, 0)])):
-        np.testing.assert_allclose(levelled.height, pivot, rtol=0, atol=atol)
-        assert levelled.height.mean() == pytest.approx(z.mean() + 0.5 * (slope_x + slope_y), abs=atol)
+    levelled = level_plane(z)
+    np.testing.assert_allclose(levelled.height, pivot, rtol=0, atol=atol)
+    assert levelled.height.mean() == pytest.approx(z.mean() + 0.5 * (slope_x + slope_y), abs=atol)
     for levelled in (level_polynomial(z, total_degree=1), level_polynomial(z), level_robust(z)):
         np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=atol)
-    zeroed = level_three_point(z, points_px=[(0, 0), (0, 7), (7, 0)], set_zero=True)
-    np.testing.assert_allclose(zeroed.height, 0.0, rtol=0, atol=10 * atol)
 
 
 @pytest.mark.parametrize(("slope_x", "slope_y"), [(0.02, -0.03), (0.0, 0.1), (0.0, 0.0)])
@@ -238,19 +235,6 @@ def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
 
 
-def test_a_disc_of_three_points_is_the_mean_of_its_selected_pixels() -> None:
-    z = ramp((20, 30), 0.3, 0.002, -0.003)
-    points = {"points_px": [(4, 4), (4, 25), (15, 8)], "radius_px": 2.0, "set_zero": True}
-    # Pixels of each disc that lie opposite each other, so that a plane keeps its mean.
-    left_out = np.zeros(z.shape, bool)
-    left_out[[3, 5, 3, 5, 14, 16], [4, 4, 25, 25, 8, 8]] = True
-    spoiled = np.where(left_out, 50.0, z)
-    for masking, mask in (("exclude", left_out), ("include", ~left_out)):
-        levelled = level_three_point(spoiled, mask=mask, masking=masking, **points)
-        assert np.abs(levelled.height[~left_out]).max() < ROUNDING
-    assert np.abs(level_three_point(spoiled, **points).height).min() > 0
-
-
 def test_matching_asks_an_inclusion_mask_in_all_columns_but_the_last() -> None:
     z = rough((20, 30), 7)
     chosen = np.random.default_rng(8).random(z.shape) < 0.8
@@ -354,8 +338,6 @@ def test_median_is_exact_where_float32_cannot_tell_values_apart() -> None:
         (lambda z: align_rows(z, degree=6), "degree"),
         (lambda z: align_rows(z, trim=0.6), "trim"),
         (lambda z: align_rows(z, method="facet-tilt"), "pitch"),
-        (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (2, 2)]), "not on one line"),
-        (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (99, 2)]), "wanted a pixel"),
         (lambda z: level_plane(z[0]), "shape"),
     ],
 )

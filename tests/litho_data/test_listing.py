@@ -29,17 +29,15 @@ def test_ids_are_those_with_both_files(tmp_path: Path) -> None:
     files = [*PAIRS, "layouts/P13.tif", "scans/P14.txt", "layouts/.P15.tif", "scans/deeper/P16.txt"]
     listing = list_fields(folder_with(tmp_path, files))
     assert [(one.id, one.print_id, one.order) for one in listing.fields] == [("P11", "1", 0), ("P12", "1", 1)]
-    reasons = {one.id: one.reason for one in listing.left_aside}
-    assert reasons == {"P13": "no file scans/P13.txt", "P14": "no file layouts/P14.tif"}
-    assert all(one.unpaired for one in listing.left_aside)
+    assert listing.unpaired == {"P13": "no file scans/P13.txt", "P14": "no file layouts/P14.tif"}
+    assert not listing.refused
     assert "the writing order is that of the sorted ids" in listing.assumptions
 
 
 def test_an_id_of_another_form_is_refused_with_a_reason(tmp_path: Path) -> None:
     listing = list_fields(folder_with(tmp_path, [*PAIRS, "layouts/Q1.tif", "scans/Q1.txt"]))
-    (refused,) = listing.left_aside
-    assert not refused.unpaired
-    assert "does not match" in refused.reason
+    assert not listing.unpaired
+    assert "does not match" in listing.refused["Q1"]
 
 
 def test_a_link_that_leads_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
@@ -52,8 +50,7 @@ def test_a_link_that_leads_out_of_the_folder_is_not_followed(tmp_path: Path) -> 
     (tmp_path / "data" / "scans" / "P13.txt").touch()
     listing = list_fields(card)
     assert [one.id for one in listing.fields] == ["P11", "P13"]
-    assert [(one.id, one.unpaired) for one in listing.left_aside] == [("P12", False)]
-    assert listing.left_aside[0].reason == "P12.txt is a link that leads out of the data folder"
+    assert listing.refused == {"P12": "P12.txt is a link that leads out of the data folder"}
 
 
 def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
@@ -75,9 +72,7 @@ def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_pat
     (tmp_path / "scans.csv").write_text("id,order\nP12,4\n", encoding="utf-8")
     listing = list_fields(card)
     assert [(one.id, one.order) for one in listing.fields] == [("P12", 4)]
-    (left,) = listing.left_aside
-    assert (left.id, left.unpaired) == ("P11", False)
-    assert left.reason == "not in scans.csv, which gives the order"
+    assert listing.refused == {"P11": "not in scans.csv, which gives the order"}
     # Without an order in the table no scan has one, and all are kept in the order of their ids.
     (tmp_path / "scans.csv").write_text("id,dose\nP12,1.5\n", encoding="utf-8")
     assert [(one.id, one.order) for one in list_fields(card).fields] == [("P11", 0), ("P12", 1)]
@@ -117,7 +112,7 @@ def test_full_scales_are_metres_by_id_or_file_name(tmp_path: Path) -> None:
     (tmp_path / "max.json").write_text(json.dumps({"P11": 1e-6, "P12.txt": 2e-6}), encoding="utf-8")
     assert [one.full_scale_um for one in list_fields(card).fields] == pytest.approx([1.0, 2.0])
     (tmp_path / "max.json").write_text(json.dumps({"P11": 1e-6}), encoding="utf-8")
-    assert "no full scale" in list_fields(card).left_aside[0].reason
+    assert "no full scale" in list_fields(card).refused["P12"]
     (tmp_path / "max.json").write_text(json.dumps({"P11": -1}), encoding="utf-8")
     with pytest.raises(InputError, match=r"P11.*positive"):
         list_fields(card)
@@ -165,11 +160,11 @@ def test_patterns_of_several_formats(tmp_path: Path, scans: str, layouts: str) -
     card.write_text(text.replace("layouts/{id}.tif", layouts))
     listing = list_fields(card)
     assert [one.scan.name for one in listing.fields] == ["P11.txt", "P12.gwy"]
-    assert listing.left_aside[0].reason == f"no file {layouts.replace('{id}', 'P13')}"
+    assert listing.unpaired["P13"] == f"no file {layouts.replace('{id}', 'P13')}"
     (tmp_path / "scans" / "P11.gwy").touch()
     listing = list_fields(card)
     assert [one.id for one in listing.fields] == ["P12"]
-    assert "several files: P11." in listing.left_aside[0].reason
+    assert "several files: P11." in listing.refused["P11"]
 
 
 @pytest.mark.parametrize("code", ["utf-8-sig", "utf-16"])

@@ -106,6 +106,7 @@ def test_a_picture_without_edges_is_refused() -> None:
         ("[write]|[process]\ntip = 0.1\n[write]", "no levelling, tip"),
         ("levels = 17|levels = 16", "levels = 17"),
         ('"sem"\n|"tem"\n', "instrument"),
+        ('"sem"\nsize_um = [0.48, 0.56]|"confocal"\n[process]\ntip = 0.1', "no tip: a confocal"),
     ],
 )
 def test_a_card_that_contradicts_its_instrument_is_refused(change: str, says: str) -> None:

@@ -58,7 +58,7 @@ def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_
     greedy = Reader("greedy", lambda path, head: path.suffix == ".txt", example.read_channels)
     register_reader(greedy)
     assert formats()[0] == "greedy"
-    with pytest.raises(InputError, match="as TOYAFM"):
+    with pytest.raises(InputError, match="as greedy"):
         read_scan(tmp_path / "scan.txt")
 
 

@@ -99,7 +99,7 @@ def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
     (pairs / "afm" / "P213.tif").unlink()
     result = import_pairs(pairs, tmp_path / "back.zarr")
     assert open_store(tmp_path / "back.zarr").ids == ["P11", "P12", "P211", "P212", "P214"]
-    assert [(one.id, one.reason) for one in result.unpaired] == [("mask/P213.tif", "no heights of this name")]
+    assert result.unpaired == {"mask/P213.tif": "no heights of this name"}
 
 
 def test_what_is_no_pair_folder(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_what_is_no_pair_folder(tmp_path: Path) -> None:
 def test_the_authors_pairs_become_whole_fields(measured_prints: Path, tmp_path: Path) -> None:
     result = import_pairs(measured_prints, tmp_path / "authors.zarr", workers=1)
     store = open_store(tmp_path / "authors.zarr")
-    assert (result.n_scans, result.skipped) == (24, [])
+    assert (result.n_scans, result.skipped) == (24, {})
     assert set(store.scan(store.ids[0]).print_id) == {"1"}
     for scan_id in ("FOV11", "FOV72"):
         # The quadrants of mask/ are bit-exact parts of the whole layouts in mask_ug/.

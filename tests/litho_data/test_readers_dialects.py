@@ -12,7 +12,6 @@ import tifffile
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import read_scan
-from tests.litho_data import map_files
 
 NY, NX, PITCH_UM = 24, 32, 0.2
 Y, X = np.mgrid[0:NY, 0:NX]
@@ -197,16 +196,6 @@ def test_what_a_tiff_says_of_itself(tmp_path: Path) -> None:
     tifffile.imwrite(path, values, description="zscale = 0.001", metadata=None)
     with pytest.raises(InputError, match=r"zscale = 0.001"):
         read_scan(path, unit="um")
-
-
-def test_nanonis_of_the_other_byte_order(tmp_path: Path) -> None:
-    path, rng = tmp_path / "scan", np.random.default_rng(0)
-    one = map_files.MapFile(HEIGHT_UM, PITCH_UM, "m")
-    map_files.sxm(path, one, rng)
-    head, data = path.read_bytes().split(b"\x1a\x04", 1)
-    swapped = np.frombuffer(data, ">f4").astype("<f4").tobytes()
-    path.write_bytes(head.replace(b"MSBFIRST", b"LSBFIRST") + b"\x1a\x04" + swapped)
-    np.testing.assert_allclose(read_scan(path, channel="Z").height_um, HEIGHT_UM, rtol=1e-7)
 
 
 @pytest.mark.parametrize("unit", ["nanometers", "Nanometre", "nanometer", "nm"])

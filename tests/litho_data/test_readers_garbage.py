@@ -25,7 +25,7 @@ STARTS = (
     b"II+\0", b"\x89PNG\r\n\x1a\n", b"BM", b"\x05\x00", b"\x00\x05", b"DIGITAL SURF\0", b"\\*File list\r\n",
     b"PK\x03\x04", b"\x89HDF\r\n\x1a\n", b"CDF\x01", b"MATLAB 5.0 MAT-file", b"WSxM file copyright",
     b"1 2 3\n", b"# Width: 1 um\n",
-    b"DSCOMPRESSED", b":NANONIS_VERSION:\n2\n:SCANIT_END:\n", b"DSAA\n3 3\n", b"DSBB\3\0\3\0",
+    b"DSCOMPRESSED", b"DSAA\n3 3\n", b"DSBB\3\0\3\0",
     b"DSRB\1\0\0\0", b"Wyko ASCII Data File Format\t0\t1\t1\nX Size\t3\n", b"MATLAB 7.3 MAT-file",
 )  # fmt: skip
 

@@ -36,6 +36,14 @@ def test_a_picture_whose_white_is_the_highest_level(
     np.testing.assert_array_equal(read_layout(path, grey_per_level=step), LEVEL)
 
 
+def test_levels_beyond_a_byte_need_a_number_of_levels(tmp_path: Path) -> None:
+    path = tmp_path / "layout.tif"
+    tifffile.imwrite(path, LEVEL.astype(np.uint16) * 5000)
+    np.testing.assert_array_equal(read_layout(path, levels=65536), LEVEL.astype(int) * 5000)
+    with pytest.raises(InputError, match="integer levels from 0 to 255"):
+        read_layout(path)
+
+
 def test_grey_values_that_are_no_steps_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "layout.png"
     cv2.imwrite(str(path), np.full((4, 4), 30, np.uint8))

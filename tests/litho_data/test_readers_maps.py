@@ -27,7 +27,6 @@ from tests.litho_data.map_files import (
     random_map,
     sdf,
     surfer,
-    sxm,
     text,
     tiff,
     wyko,
@@ -91,7 +90,7 @@ def test_the_law_can_fail(tmp_path: Path, seed: int) -> None:
 
 # Rows of the page's table by how they begin: a writer, or real files of the other tests.
 TRIED = {
-    "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "SXM": sxm, "TIFF": tiff, "GSF": gsf,
+    "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "TIFF": tiff, "GSF": gsf,
     "NPY": numpy_archive, "NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,
     "HDF5 of JPK": nhf, "HDF5 of any": hdf5,
     "SPM": afm_files.write_spm, "SUR, MNT": digital_surf, "JPK": afm_files.write_jpk, "Park Systems": park,
@@ -112,7 +111,7 @@ def test_every_format_of_the_page_has_a_file_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("writer", "format"),
     [
-        (text, "text-matrix"), (surfer, "surfer"), (wyko, "wyko"), (sxm, "sxm"), (tiff, "tiff"), (gsf, "gsf"),
+        (text, "text-matrix"), (surfer, "surfer"), (wyko, "wyko"), (tiff, "tiff"), (gsf, "gsf"),
         (nhf, "hdf5"), (hdf5, "hdf5"), (netcdf, "netcdf"), (matlab, "matlab"), (digital_surf, "vendor"),
         (park, "vendor"), (sdf, "vendor"), (bcr, "vendor"),
     ],

@@ -26,7 +26,7 @@ def built(card: Path) -> tuple[dict[str, str], dict[str, str]]:
     result = build_dataset(card, card.parent / "prints.zarr")
     quality = open_store(card.parent / "prints.zarr").quality
     warnings = dict(zip(quality["scan"], quality["warning"], strict=True))
-    return warnings, {one.id: one.reason for one in result.skipped}
+    return warnings, result.skipped
 
 
 def doubted(warnings: dict[str, str]) -> set[str]:

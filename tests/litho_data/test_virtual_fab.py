@@ -256,11 +256,6 @@ class TestFiles:
             clean = np.load(tmp_path / "run" / "truth" / "prints" / f"{scan.id}.npy")
             assert clean.shape == read_layout(field.layout).shape
 
-    def test_files_only_tells_nothing_else(self, tmp_path):
-        card_path = simulate(tmp_path / "run", count=2, size_px=64, metadata="files-only")
-        card = load_card(card_path)
-        assert (card.ids.print, card.ids.table, card.write) == (None, None, None)
-
     def test_layouts_of_a_card_can_be_printed(self, tmp_path):
         first = simulate(tmp_path / "a", count=3, size_px=64, seed=1)
         jobs = jobs_of_card(first)
@@ -274,8 +269,6 @@ class TestFiles:
         for settings in (
             {"knobs": ["nosuch=1"]},
             {"noise": "loud"},
-            {"metadata": "some"},
-            {"metadata": "files-only", "references": True},
             {"count": 0},
         ):
             with pytest.raises(InputError):

@@ -68,7 +68,7 @@ def test_a_bead_on_slopes_along_x_is_seen():
     ]
     truth = beaded[-1].height_um
     errors = {
-        name: error_nm(fit(name, beaded[:-1], TrainingConfig(nuisance="offset")), beaded[-1], truth)
+        name: error_nm(fit(name, beaded[:-1], TrainingConfig(nuisance="offset")).model, beaded[-1], truth)
         for name in ("linear", "features")
     }
     # The bead is 12 nm high on average; squares of slopes follow a size only roughly.

@@ -14,8 +14,6 @@ from litho_data.virtual_fab.films import FilmKnobs
 from litho_models.effects import CATALOGUE
 from litho_models.models import build_model
 
-ANSWERS = [(["etch-bias"], True), ([], False), (["etch-bias", "more"], False)]
-
 
 @pytest.mark.parametrize("process", sorted(BASES))
 def test_seven_of_ten_trials_have_one_cause_which_the_loop_could_name(process: str) -> None:
@@ -46,4 +44,7 @@ def test_an_answer_is_right_if_it_names_the_cause_and_nothing_else(
     trial = next(one for one in draw("e-beam", 1) if one.cause == "etch_bias_um")
     found = run(trial, "e-beam", 1, tmp_path)
     assert found["right"] == right
-    assert ("yes" if right else "no") in text_of([found])
+    record = {"processes": {"e-beam": [found, {**found, "planted": "nothing", "right": True}]}}
+    table = text_of(record)
+    assert f"| e-beam | etch_bias_um | {int(right)} of 1 | 1.00 → 1.00 nm |" in table
+    assert "| e-beam | nothing | 1 of 1 |" in table

@@ -50,10 +50,12 @@ def test_a_disc_that_is_too_large_is_off_by_the_difference_of_radii() -> None:
     assert scores.ssim is None
 
 
-def test_only_films_have_the_figures_of_films() -> None:
-    scan = replace(_scan(_disc(30)), seen_by="afm")
+@pytest.mark.parametrize("instrument", ["afm", "profilometer", "confocal"])
+def test_only_films_have_the_figures_of_films(instrument: str) -> None:
+    scan = replace(_scan(_disc(30)), seen_by=instrument)
     scores = score_model("m", [scan], [Prediction(_disc(31))], NuisanceProtocol.of_policy("offset"))
     assert scores.leading_nm == scores.mae_datum_free_nm
+    assert scores.ssim is not None
     assert not scores.metrics
 
 

@@ -98,7 +98,7 @@ def test_the_pixels_of_a_scan_go_from_the_table_to_the_loop(tmp_path: Path) -> N
         for i, size in enumerate((1.0, 0.5))
     ]
     card = simulate(tmp_path / "fab", jobs=jobs, seed=3)
-    assert read_table(card.parent / "scans.csv")["P1F1"]["pixel_size"] == "0.5"
+    assert read_table(card.parent / "scans.csv")["P1F1"]["pixel_size"] == 0.5
     first, second = (np.loadtxt(card.parent / "scans" / f"P{i}F1.txt").shape for i in (0, 1))
     assert second == (2 * first[0], 2 * first[1])
     build_dataset(card, tmp_path / "store.zarr")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting import TrainingConfig, fit
 from litho_models.models import build_model
 from litho_models.models.fno import PeriodicConvolution, SpectralConvolution
 from litho_models.prediction.tiles import blend_tiles, blending_window, predict_scan
@@ -199,11 +199,11 @@ def test_the_published_variant_takes_other_sizes(size):
 )
 def test_every_recipe_trains_every_variant(recipe, variant):
     fields = SMALL if variant == "default" else {"width": 4, "modes": (4, 4), "projection_channels": 8}
-    settings = {**QUICK, "variant": variant, "learning_rate": 5e-3}
+    settings = {**QUICK, "variant": variant, "learning_rate": 5e-3, "model": fields}
     settings |= {"crop_px": 48} if recipe == "paper" else {}
     config = TrainingConfig.of_recipe(recipe, "fno", **settings)
     scans = make_scans(4, size_px=64)
-    fitted = fit_with_record("fno", scans, config, model_fields=fields)
+    fitted = fit("fno", scans, config)
     errors = [entry.training_mae_nm for entry in fitted.history]
     assert errors[-1] < errors[0]
     assert np.isfinite(predict_scan(fitted.model, scans[0])).all()
@@ -223,16 +223,16 @@ def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
     monkeypatch.setattr(Fno, "interior", watched)
     # Scans narrower than a tile, and a crop size that is not the tile's.
     for size_px in (28, 64):
-        fit_with_record(
-            "fno", make_scans(3, size_px=size_px), TrainingConfig(**QUICK, crop_px=40), model_fields=SMALL
-        )
+        fit("fno", make_scans(3, size_px=size_px), TrainingConfig(**QUICK, crop_px=40, model=SMALL))
     assert set(shapes) == {(32, 32)}
 
 
 def test_fno_learns_a_blur_beyond_its_start():
     scans = make_scans(4, size_px=64, noise_um=0.002, datum_um=0.0)
-    config = TrainingConfig(**{**QUICK, "steps": 120, "learning_rate": 5e-3, "validation_scans": 0})
-    fitted = fit_with_record("fno", scans, config, model_fields=SMALL)
+    config = TrainingConfig(
+        **{**QUICK, "steps": 120, "learning_rate": 5e-3, "validation_scans": 0, "model": SMALL}
+    )
+    fitted = fit("fno", scans, config)
     start = build_model("fno", **SMALL)
 
     def error(model):
@@ -251,8 +251,8 @@ def test_what_is_not_measured_does_not_teach():
         height = np.where(valid, scan.height_um, np.nan).astype(np.float32)
         broken.append(replace(scan, height_um=height, valid=valid))
     also = [replace(scan, height_um=np.where(scan.valid, scan.height_um, 5.0)) for scan in broken]
-    config = TrainingConfig(**QUICK, validation_scans=0)
-    first, second = (fit_with_record("fno", each, config, model_fields=SMALL) for each in (broken, also))
+    config = TrainingConfig(**QUICK, validation_scans=0, model=SMALL)
+    first, second = (fit("fno", each, config) for each in (broken, also))
     assert math.isfinite(first.history[-1].training_mae_nm)
     for one, other in zip(first.model.parameters(), second.model.parameters(), strict=True):
         assert torch.equal(one, other)

@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
 from litho_models.cli.app import app
 from litho_models.evaluation.benchmark import benchmark
-from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting import TrainingConfig, fit
 from litho_models.fitting.checkpoint import CheckpointFolder
 from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import ModelCard
@@ -74,11 +74,11 @@ def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
     scans, config = make_scans(4, size_px=64), TrainingConfig(**QUICK)
     monkeypatch.setattr(CheckpointFolder, "save", save_and_die)
     with pytest.raises(Killed):
-        fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+        fit("pbl", scans, config, checkpoint=tmp_path / "run")
     monkeypatch.undo()
-    resumed = fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+    resumed = fit("pbl", scans, config, checkpoint=tmp_path / "run")
     assert [entry.step for entry in resumed.history] == [1, 2]
-    assert resumed.seconds == 1000.0 + resumed.history[1].seconds
+    assert resumed.facts.seconds == 1000.0 + resumed.history[1].seconds
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_a_damaged_fit_is_told_where_the_noise_reads_it_too(scored, store, tmp_p
 
 def test_a_result_lists_the_settings_that_a_fit_used(scored):
     settings = json.loads((scored[1] / "benchmark.json").read_text())["training"]
-    affine = {"recipe": "fast", "variant": "paper", "seed": 0, "nuisance": "offset", "free_gain": False}
+    affine = {"recipe": "fast", "variant": "paper", "seed": 0, "nuisance": "offset"}
     assert settings["affine"] == {**affine, "model": {}, "optimiser": "gauss-newton"}
     assert {**settings["pbl"], **QUICK} == TrainingConfig(**QUICK).model_dump(mode="json")
 

@@ -98,8 +98,11 @@ PLACES["r2"] = PLACES["x"] ** 2 + PLACES["y"] ** 2
 EDGE_PX = np.minimum(
     *np.meshgrid(*(np.minimum(np.arange(n), np.arange(n)[::-1]) for n in SHAPE), indexing="ij")
 )
-PLACES["rim"] = np.exp(-EDGE_PX * PITCH_UM / 2.0)
 ORDER = 0.3
+
+
+def rim(length_um: float) -> np.ndarray:
+    return np.exp(-EDGE_PX * PITCH_UM / length_um)
 
 
 def jump(axis: str, at: float) -> np.ndarray:
@@ -136,7 +139,12 @@ def formulas() -> dict[str, Formula]:
         found[f"height-power-{power}"] = lambda h, p=power: h**p
     for place, own in PLACES.items():
         found[f"height-times-{place}"] = lambda h, p=own: h * p
-        found[f"blur-times-{place}"] = lambda h, p=own: (mean_within(h, 1.5) - h) * p
+        found[f"blur-times-{place}"] = lambda h, length_um=1.5, p=own: (mean_within(h, length_um) - h) * p
+    for axis in ("x", "y"):
+        found[f"slope-size-{axis}-times-rim"] = lambda h, length_um=1.5, a=axis: (
+            np.abs(slope(h, a)) * rim(length_um)
+        )
+    found["height-times-rim"] = lambda h, length_um=1.5: h * rim(length_um)
     found["height-squared-times-order"] = lambda h: h**2 * ORDER
     found["steepness-power"] = lambda h, power: np.hypot(slope(h, "x"), slope(h, "y")) ** power
     found["surroundings"] = lambda h, length_um: mean_within(h, length_um) - h
@@ -159,9 +167,10 @@ WAVES = ("height-wave", "dose-wave")
 
 
 def shapes_of(name: str) -> list[dict[str, float]]:
-    """The shapes in which a law is screened."""
+    """The shapes in which a law is screened, and twice a length that is not varied there."""
     shapes = [{k: v for k, v in trial.items() if k != "strength"} for trial in LAWS[name].trials]
-    return list(map(dict, dict.fromkeys(tuple(one.items()) for one in shapes)))
+    untried = {k: 2 * one.typical for k, one in LAWS[name].parameters.items() if one.off and not one.tried}
+    return list(map(dict, dict.fromkeys(tuple(one.items()) for one in (*shapes, {**shapes[0], **untried}))))
 
 
 def test_every_law_has_a_formula_here() -> None:

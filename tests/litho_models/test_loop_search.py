@@ -255,6 +255,8 @@ def test_what_scans_cannot_test_is_said_before_any_fit() -> None:
     needing = {name for name, one in CATALOGUE.items() if "order" in one.needs and not one.per_scan}
     assert set(untestable(study_of(unordered))) == needing
     assert needing
+    by_light = [replace(scan, seen_by="confocal") for scan in scans]
+    assert set(untestable(study_of(by_light))) == {"tip-dilation", "feedback-lag"}
     for tested in (scans, [flat[0], *scans[1:]]):
         assert untestable(study_of(tested)) == {}
 

@@ -384,7 +384,7 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     # The microscope turns a scan by up to 0.6 degrees on its own.
     assert abs(math.degrees(math.atan2(turned[1, 0], turned[0, 0])) - 90) < 1
     rows = read_table(card.parent / "scans.csv")
-    assert rows["N1F2"]["turned_deg"] == "90.0"
+    assert rows["N1F2"]["turned_deg"] == 90
     assert rows["N0F1"]["use"] == "substrate"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,11 @@ import torch
 from scipy.signal import fftconvolve
 
 from litho_data.foundation.errors import InputError
+from litho_data.layouts.random_layout import random_layout
 from litho_models import load_frozen
 from litho_models.cli.app import main
 from litho_models.fitting.small_models import fit_small_model
-from litho_models.models import MODELS, build_model, fixed_numbers
+from litho_models.models import MODELS, build_model, fixed_numbers, kernels_part
 from litho_models.models.hopkins import Optics, imaged, intensity, kernel_reach_px, transfer_functions
 from litho_models.models.parts import PARTS, Number, Part, contrast_curve, register_part
 from litho_models.models.printers import Printer
@@ -141,6 +143,51 @@ def test_a_field_is_imaged_as_its_part_is_and_an_open_mask_is_bright() -> None:
     assert torch.allclose(intensity(torch.ones_like(mask), lens, PITCH_UM), torch.ones(40, 30), atol=1e-5)
 
 
+def test_kernels_in_a_file_image_as_the_lens_they_come_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
+    lens = LENS._replace(kernels=5)
+    size = 2 * kernel_reach_px(lens, PITCH_UM) + 1
+    kernels = np.fft.fftshift(np.fft.ifft2(transfer_functions(lens, PITCH_UM, (size, size))), axes=(-2, -1))
+    np.save(tmp_path / "kernels.npy", kernels)
+    register_part(kernels_part("own-lens", tmp_path / "kernels.npy"))
+    numbers = {f"lens.{name}": value for name, value in lens._asdict().items()}
+    layout = (
+        0.1
+        * torch.from_numpy(random_layout((60, 50), cutoff_per_um=1.0, pitch_um=PITCH_UM)[None, None]).float()
+    )
+    own, known = (
+        build_model("projection", pitch_um=PITCH_UM, **parts)(layout)
+        for parts in ({"parts": ("own-lens",)}, {"parts": ("lens",), **numbers})
+    )
+    torch.testing.assert_close(own, known, rtol=0, atol=1e-5)
+    np.save(tmp_path / "even.npy", kernels[:, 1:, 1:])
+    for file, said in {"even.npy": "odd", "none.npy": "no such file"}.items():
+        with pytest.raises(InputError, match=said):
+            kernels_part("wrong", tmp_path / file)
+
+
+def test_physics_is_a_printer_of_spot_threshold_shrinkage_and_transfer() -> None:
+    physics = build_model("physics", sigma_diffusion_init_um=0.7, gain_init=0.9, kappa_min_init=0.3)
+    values = {name: value.item() for name, value in physics.values.items()}
+    assert values["bias_um"] == 0
+    parts = printer(
+        "laser-writer",
+        parts=("spot", "tanh", "shrinkage", "transfer"),
+        **{
+            "spot.sigma_um": physics.config.sigma_optical_um,
+            "tanh.contrast": values["alpha"],
+            "tanh.threshold": values["eta"],
+            "shrinkage.sigma_um": values["sigma_diffusion_um"],
+            "shrinkage.kappa_min": values["kappa_min"],
+            "transfer.selectivity": values["gain"],
+        },
+    )
+    layout = 0.1 * torch.from_numpy(random_layout((64, 64))[None, None]).float()
+    torch.testing.assert_close(parts(layout), physics(layout), rtol=0, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_one_batch_of_kernels_is_faster_than_one_convolution_after_the_other() -> None:
     lens = LENS._replace(kernels=12)
@@ -183,13 +230,50 @@ def test_every_part_states_its_source_and_numbers_within_their_range() -> None:
 def test_a_part_of_ones_own_is_a_stage_of_a_printer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("litho_models.models.parts.PARTS", dict(PARTS))
     numbers = {"gain": Number(0.5)}
-    register_part(Part("gain", "transfer", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
+    register_part(Part("gain", numbers, lambda field, own, pitch: own["gain"] * field, "a test"))
     model = printer("laser-writer", parts=("spot", "gain"))
     assert set(model.values) == {"spot.sigma_um", "gain.gain"}
     flat = torch.full((1, 1, 40, 40), 0.8)
     assert torch.allclose(model(flat), torch.full_like(flat, 0.4))
     with pytest.raises(InputError, match="not taken"):
         register_part(PARTS["etch"])
+
+
+def test_pbl_begins_as_the_image_of_any_illumination() -> None:
+    layout = 0.1 * torch.from_numpy(random_layout((64, 64))[None, None]).float()
+    own = {"sigma_diffusion_init_um": 0.1, "surroundings": None, "scan_axis": None}
+    plain, spot = (build_model("pbl", **own, **more) for more in ({}, {"illumination": "spot"}))
+    spot.load_state_dict(plain.state_dict())
+    torch.testing.assert_close(plain(layout), spot(layout), rtol=0, atol=1e-5)
+    numbers = {"na": 0.5, "wavelength_um": 0.4, "kernels": 3}
+    pbl = build_model("pbl", illumination="lens", numbers=numbers, **own)
+    bare = build_model(
+        "projection", parts=("lens",), **{f"lens.{key}": value for key, value in numbers.items()}
+    )
+    torch.testing.assert_close(pbl(layout), bare(layout), rtol=0, atol=1e-5)
+    for wrong in ({"illumination": "lamp"}, {"illumination": "lens", "numbers": {"sigma_um": 1}}):
+        with pytest.raises(InputError, match=r"lamp|sigma_um"):
+            build_model("pbl", **wrong)
+
+
+def test_a_contrast_curve_of_256_levels_is_fitted_by_33_heights() -> None:
+    geometry = {"pitch_um": 0.1, "levels": 256, "level_height_um": 1.2 / 255}
+    true = printer("laser-writer", **geometry)
+    scans = []
+    for number, scan in enumerate(make_scans(3, 64)):
+        level = random_layout((64, 64), levels=256, cutoff_per_um=0.5, seed=number)
+        scan = replace(scan, mask_level=level, levels=256, level_height_um=geometry["level_height_um"])
+        height = true(torch.from_numpy(scan.layout_um)[None, None])[0, 0].detach().numpy()
+        scans.append(replace(scan, height_um=height))
+    table = build_model("blur-table", **geometry)
+    assert table.parameter_count == 1 + 33
+    fit_small_model(table, scans, "none")
+    held_out = torch.from_numpy(
+        random_layout((64, 64), levels=256, cutoff_per_um=0.5, seed=9) * np.float32(1.2 / 255)
+    )
+    off = (table(held_out[None, None]) - true(held_out[None, None])).detach().abs()
+    # Between 33 heights lines cut the corners of the curve, which are rounded over a twentieth of the range.
+    assert float(off.mean()) < 0.004 * 1.2
 
 
 def test_a_fixed_number_stays_and_a_freed_one_does_not() -> None:

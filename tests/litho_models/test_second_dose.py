@@ -77,9 +77,9 @@ def test_plan_and_loop_see_a_dose_as_the_fab_does() -> None:
     assert (weak.context.dose, usual.context.dose) == (0.8, 1.0)
 
 
-@pytest.mark.parametrize(("gain", "doses"), [(2.0, {"1.0", "0.8"}), (1.1, {"1.0"})])
+@pytest.mark.parametrize(("gain", "doses"), [(2.0, {1.0, 0.8}), (1.1, {1.0})])
 def test_a_plan_takes_a_second_dose_where_it_separates(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, doses: set[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, doses: set[float]
 ) -> None:
     loop = closed_loop(tmp_path / "loop", [slope_question()])
     plain = designer.score

@@ -34,6 +34,9 @@ def ramp(shift_px=0.0, degrees=0.0, shape=(120, 140)):
 
 def test_contours_lie_half_way_between_the_levels():
     assert mid_step_heights_um(4, 0.2) == pytest.approx([0.1, 0.3, 0.5])
+    # Of a thousand steps of 1 nm every 24th part of the height has one.
+    many = mid_step_heights_um(1001, 0.001)
+    assert many[[0, 1, -1]] == pytest.approx([1 / 48, 3 / 48, 47 / 48])
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 0.13, -0.5, 2.75, 4.9])

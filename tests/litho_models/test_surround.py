@@ -40,7 +40,7 @@ def alone(number: int, surround: str) -> PrintedScan:
 @pytest.mark.parametrize("surround", ["substrate", "unknown"])
 def test_a_lone_field_has_no_ring_of_errors(surround: str) -> None:
     scans = [alone(number, surround) for number in range(4)]
-    model = fit("features", scans[1:], TrainingConfig())
+    model = fit("features", scans[1:], TrainingConfig()).model
     off = predict_scan(model, scans[0]) - scans[0].height_um
     valid = scans[0].valid
     ring = valid & ~binary_erosion(valid, iterations=RIM_PX)
@@ -55,7 +55,7 @@ def test_what_stands_beside_the_valid_pixels_changes_nothing() -> None:
     expected = scan.layout_um
     freed = [cross_fit(one.height_um, expected, one.valid, POLICIES["offset"]) for one in (scan, other)]
     np.testing.assert_array_equal(*(one.residual_um for one in freed))
-    fitted = [fit("features", [one], TrainingConfig()) for one in (scan, other)]
+    fitted = [fit("features", [one], TrainingConfig()).model for one in (scan, other)]
     np.testing.assert_array_equal(*(predict_scan(model, scan) for model in fitted))
     for one in prepare_scans([scan, other]):
         np.testing.assert_array_equal(one.usable, scan.valid)

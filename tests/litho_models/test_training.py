@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_models.fitting import TrainingConfig, fit, fit_with_record, small_models
+from litho_models.fitting import TrainingConfig, fit, small_models
 from litho_models.fitting import stochastic as network
 from litho_models.fitting.checkpoint import CheckpointFolder, TrainingState
 from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
@@ -51,7 +51,7 @@ def test_gauss_newton_recovers_an_affine_printer_exactly():
 
 def test_blur_table_finds_the_blur_and_the_saturation_through_datum_and_bow():
     scans = make_scans(4, size_px=96, bow_um=0.03)
-    model = fit("blur-table", scans, TrainingConfig(nuisance="full"))
+    model = fit("blur-table", scans, TrainingConfig(nuisance="full")).model
     assert float(model.sigma_um.detach()) == pytest.approx(BLUR_UM, abs=0.01)
     # Never seen, without noise, its own datum not added: 0.5 nm are the table's chords of 0.1 µm.
     assert error_nm(model, make_scan(20, noise_um=0.0, datum_um=0.0)) < 1.0
@@ -59,8 +59,8 @@ def test_blur_table_finds_the_blur_and_the_saturation_through_datum_and_bow():
 
 def test_ignoring_the_datum_costs_what_freeing_it_saves():
     scans = make_scans(5, size_px=96, datum_um=0.04)
-    free = fit("linear", scans, TrainingConfig(nuisance="offset"))
-    blind = fit("linear", scans, TrainingConfig(nuisance="none"))
+    free = fit("linear", scans, TrainingConfig(nuisance="offset")).model
+    blind = fit("linear", scans, TrainingConfig(nuisance="none")).model
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     # Five scans of ±40 nm: their mean is +8 nm, where the free fit pins its offset, give or take the fit.
     assert error_nm(free, unseen) == pytest.approx(8.0, abs=2.0)
@@ -69,7 +69,7 @@ def test_ignoring_the_datum_costs_what_freeing_it_saves():
 
 @pytest.mark.parametrize("name", ["affine-mtf", "linear"])
 def test_small_models_come_close_to_the_printer(name):
-    model = fit(name, make_scans(4, size_px=96), TrainingConfig(nuisance="offset"))
+    model = fit(name, make_scans(4, size_px=96), TrainingConfig(nuisance="offset")).model
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     start = error_nm(build_model(name), unseen)
     assert error_nm(model, unseen) < 0.35 * start
@@ -85,7 +85,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
         gain_init=0.7,
         bias_init_um=0.02,
     )
-    model = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset"))
+    model = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset")).model
     unseen = make_scan(20)
     difference = predict_scan(model, unseen) - predict_scan(printer, unseen)
     # Noise of 4 nm on 9,000 used pixels fixes six values to well below 1 nm of height.
@@ -97,9 +97,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
 def test_a_fit_stops_at_a_bound_and_names_it():
     printer = build_model("physics", sigma_diffusion_init_um=0.6, kappa_min_init=0.5)
     narrow = {"sigma_diffusion_max_um": 0.2, "sigma_diffusion_init_um": 0.1}
-    fitted = fit_with_record(
-        "physics", printed_by(printer), TrainingConfig(nuisance="offset"), model_fields=narrow
-    )
+    fitted = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset", model=narrow))
     assert fitted.model.at_bounds == {"sigma_diffusion_um": 0.2}
     # The raw number stays where the value still follows it.
     assert abs(float(fitted.model.tau.detach())) == pytest.approx(FLAT_FROM)
@@ -131,7 +129,7 @@ def test_a_network_learns_what_the_stiff_start_does_not_know():
     config = TrainingConfig(
         **{**QUICK, "steps": 60, "learning_rate": 5e-3, "nuisance": "offset", "validation_scans": 0}
     )
-    fitted = fit_with_record("pbl", scans, config, model_fields=SMALL_NETS)
+    fitted = fit("pbl", scans, config)
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     start = error_nm(build_model("pbl", **SMALL_NETS), unseen)
     assert error_nm(fitted.model, unseen) < 0.5 * start
@@ -141,8 +139,7 @@ def test_a_network_learns_what_the_stiff_start_does_not_know():
 def test_same_seed_same_weights_other_seed_other_weights():
     scans = make_scans(4, size_px=64)
     runs = [
-        fit_with_record("pbl", scans, TrainingConfig(**QUICK, seed=seed), model_fields=SMALL_NETS).model
-        for seed in (1, 1, 2)
+        fit("pbl", scans, TrainingConfig(**QUICK, seed=seed, model=SMALL_NETS)).model for seed in (1, 1, 2)
     ]
     states = [torch.cat([p.flatten() for p in run.parameters()]) for run in runs]
     assert torch.equal(states[0], states[1])
@@ -151,8 +148,8 @@ def test_same_seed_same_weights_other_seed_other_weights():
 
 def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
     scans = make_scans(4, size_px=64)
-    config = TrainingConfig(**QUICK)
-    whole = fit_with_record("pbl", scans, config, model_fields=SMALL_NETS)
+    config = TrainingConfig(**QUICK, model=SMALL_NETS)
+    whole = fit("pbl", scans, config)
 
     class Killed(Exception):
         pass
@@ -166,9 +163,9 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
 
     monkeypatch.setattr(CheckpointFolder, "save", save_and_die)
     with pytest.raises(Killed):
-        fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run", model_fields=SMALL_NETS)
+        fit("pbl", scans, config, checkpoint=tmp_path / "run")
     monkeypatch.undo()
-    resumed = fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run", model_fields=SMALL_NETS)
+    resumed = fit("pbl", scans, config, checkpoint=tmp_path / "run")
     for (name, a), (_, b) in zip(
         whole.model.state_dict().items(), resumed.model.state_dict().items(), strict=True
     ):
@@ -180,7 +177,7 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
 def quick_run(tmp_path_factory):
     """Scans, and the checkpoint of a small PBL trained on them."""
     scans, folder = make_scans(4, size_px=64), tmp_path_factory.mktemp("run")
-    fit_with_record("pbl", scans, TrainingConfig(**QUICK), checkpoint=folder, model_fields=SMALL_NETS)
+    fit("pbl", scans, TrainingConfig(**QUICK, model=SMALL_NETS), checkpoint=folder)
     return scans, folder
 
 
@@ -230,18 +227,14 @@ def test_a_checkpoint_of_another_run_is_refused(what, quick_run):
     model, given, settings, fields = ANOTHER_RUN[what](scans)
     kept = {file.name: file.read_bytes() for file in folder.iterdir()}
     with pytest.raises(InputError, match="another model, configuration or dataset"):
-        fit_with_record(
-            model, given, TrainingConfig(**{**QUICK, **settings}), checkpoint=folder, model_fields=fields
-        )
+        fit(model, given, TrainingConfig(**{**QUICK, **settings}, model=fields), checkpoint=folder)
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == kept
 
 
 def test_the_checkpoint_is_chosen_on_inner_validation_scans_only():
-    fitted = fit_with_record(
-        "pbl", make_scans(8, size_px=64), TrainingConfig(**QUICK), model_fields=SMALL_NETS
-    )
-    assert len(fitted.validation_ids) == 2
-    assert not set(fitted.validation_ids) & set(fitted.training_ids)
+    fitted = fit("pbl", make_scans(8, size_px=64), TrainingConfig(**QUICK, model=SMALL_NETS))
+    assert len(fitted.facts.validation_ids) == 2
+    assert not set(fitted.facts.validation_ids) & set(fitted.facts.training_ids)
     assert all(entry.validation_mae_datum_free_nm is not None for entry in fitted.history)
 
 
@@ -254,7 +247,7 @@ def test_crops_carry_their_surroundings_and_continue_the_edge():
 
 
 def test_passes_change_the_memory_and_not_the_step(monkeypatch):
-    config = TrainingConfig(**{**QUICK, "steps": 4, "rounds": 1})
+    config = TrainingConfig(**{**QUICK, "steps": 4, "rounds": 1}, model=SMALL_NETS)
     crops = []
     interior = Pbl.interior
 
@@ -266,7 +259,7 @@ def test_passes_change_the_memory_and_not_the_step(monkeypatch):
     monkeypatch.setattr(Pbl, "interior", counted)
 
     def trained():
-        return fit_with_record("pbl", make_scans(4, size_px=64), config, model_fields=SMALL_NETS)
+        return fit("pbl", make_scans(4, size_px=64), config)
 
     together = trained()
     monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
@@ -291,8 +284,10 @@ def test_precision_is_that_of_the_network_and_never_of_its_layout(crops, precisi
         return height
 
     monkeypatch.setattr(Pbl, "interior", watched)
-    config = TrainingConfig(**{**QUICK, "crops": crops, "precision": precision, "validation_scans": 0})
-    fit_with_record("pbl", make_scans(2, size_px=64), config, model_fields=SMALL_NETS)
+    config = TrainingConfig(
+        **{**QUICK, "crops": crops, "precision": precision, "validation_scans": 0, "model": SMALL_NETS}
+    )
+    fit("pbl", make_scans(2, size_px=64), config)
     # A layout of 1.1 µm rounded to bfloat16 is 1.6 nm too high.
     assert set(seen) == {(precision == "bf16-mixed", torch.float32, torch.float32)}
 
@@ -315,8 +310,9 @@ def test_reduced_precision_trains_as_full_precision_does(name, variant):
             crop_px=32,
             precision=precision,
             validation_scans=0,
+            model=fields,
         )
-        fitted = fit_with_record(name, scans, config, model_fields=fields)
+        fitted = fit(name, scans, config)
         errors.append([entry.training_mae_nm for entry in fitted.history])
     reduced, full = errors
     # 8 bits of significance in the features, averaged over thousands of pixels.
@@ -343,12 +339,12 @@ def test_the_paper_recipe_is_the_papers():
 def test_the_paper_recipe_trains_physics_with_adam_towards_the_printer():
     scans = make_scans(4, size_px=64, datum_um=0.0)
     config = TrainingConfig.of_recipe("paper", "physics", steps=120, rounds=3, crop_px=32, validation_scans=0)
-    fitted = fit_with_record("physics", scans, config)
+    fitted = fit("physics", scans, config)
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     assert [entry.step for entry in fitted.history] == [40, 80, 120]
     assert error_nm(fitted.model, unseen) < 0.7 * error_nm(build_model("physics"), unseen)
     # A baseline that the paper does not train is fitted as ever.
-    assert not fit_with_record("affine", scans, TrainingConfig.of_recipe("paper", "affine")).history
+    assert not fit("affine", scans, TrainingConfig.of_recipe("paper", "affine")).history
 
 
 def test_the_fast_recipe_takes_each_network_s_own_number_of_steps_unless_told():
@@ -456,5 +452,5 @@ def test_a_training_that_diverges_is_told_in_one_line(name, rate, tmp_path):
     with pytest.raises(
         InputError, match=rf"^training of {name}, got .* beyond all heights .*smaller learning_rate$"
     ):
-        fit_with_record(name, make_scans(2, size_px=64), config, checkpoint=tmp_path / "kept")
+        fit(name, make_scans(2, size_px=64), config, checkpoint=tmp_path / "kept")
     assert not list(tmp_path.iterdir())

@@ -1,0 +1,151 @@
+"""A film corrected through the printer of parts of the second machine, and judged by other models.
+
+    python -m benchmarks.film_design prefab-soi.zarr [--publish]
+
+What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects, a blur
+with a table and random features judge. They share its micrographs, but no formula.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import conclude, options, origin
+from benchmarks.second_machine import PAGE, judged
+from benchmarks.second_machine import RESULT as MACHINE
+from litho_data.commands.progress import run_script
+from litho_data.reports.pictures import new_figure
+from litho_data.store import open_store
+from litho_design import correct, load_design
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import load_printer
+from litho_design.reliefs.settings import ReliefSettings, relief_settings
+from litho_models import freeze, train
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from litho_data.store import PrintedScan
+
+RESULT = MACHINE.with_name("film_design.json")
+PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
+DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
+# Beyond the design nothing is written, which the pattern does not say of its surroundings.
+RIM_PX = 24
+PICTURE = """![Corrected layout; wanted film and edges of both prints](results/second-machine/design.png)
+
+*The corrected layout (grey: part of the dose), and the edges that `blur-table` predicts for both layouts.*"""
+
+
+def main() -> None:
+    """Train, correct, judge, write."""
+    parser = options(__doc__, "write the table into the page", RESULT)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--cache", type=Path, default=Path("runs/film-design"), help="models and design")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    scan = open_store(given.store).scan(PATTERN)
+    settings = settings_for(scan)
+    film = wanted_film(scan)
+    printers = {name: printer(name, given.store, given.cache, settings) for name in (DESIGNER, *JUDGES)}
+    out = given.cache / "design"
+    if not (out / "design.json").is_file():
+        correct(film.height_um, printers[DESIGNER], out, settings=settings, robust=False, announce=False)
+    layouts = {
+        "uncorrected": film.height_um,
+        "corrected": load_design(out).level.numpy() * np.float32(scan.level_height_um),
+    }
+    prints = {
+        (name, kind): printed(one, layout, settings)
+        for name, one in printers.items()
+        for kind, layout in layouts.items()
+    }
+    record = {
+        "run": origin(),
+        "pattern": PATTERN,
+        "size_px": SIZE_PX,
+        "pitch_um": scan.pitch_um,
+        "rows": [
+            {"model": name, "layout": kind, **judged(film, one)} for (name, kind), one in prints.items()
+        ],
+    }
+    if given.publish:
+        by_judge = {kind: prints[JUDGES[0], kind] for kind in layouts}
+        figure = drawn(film.height_um, layouts["corrected"], by_judge)
+        figure.savefig(given.out.with_name("design.png"), dpi=110)
+    conclude(record, text_of(record), given.out, PAGE, "film design", published=given.publish)
+
+
+def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
+    """A relief of one height, at the pitch and levels of the store."""
+    geometry = {"pitch_um": scan.pitch_um, "cell_um": scan.pitch_um, "levels": scan.levels}
+    geometry |= {"size_px": size_px, "level_height_um": scan.level_height_um}
+    changes = {f"layout.{name}": value for name, value in geometry.items()}
+    return relief_settings({**changes, "search.polish_rounds": POLISH})
+
+
+def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
+    """The middle square of the layout as the film that is to be printed; its rim is not scored."""
+    top, left = ((length - size_px) // 2 for length in scan.shape)
+    level = scan.mask_level[top : top + size_px, left : left + size_px]
+    inner = np.pad(np.ones([size_px - 2 * RIM_PX] * 2, bool), RIM_PX)
+    film = replace(scan, mask_level=level, valid=inner, height_sigma_um=None)
+    return replace(film, height_um=film.layout_um)
+
+
+def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Printer:
+    """A model trained on the store, frozen, as a printer."""
+    folder = cache / name
+    if not (folder / "printer" / "card.json").is_file():
+        train(store, name, folder / "run", settings={"nuisance": "none"})
+        freeze(folder / "run", folder / "printer")
+    return load_printer(folder / "printer", settings.layout)
+
+
+@torch.no_grad()
+def printed(by: Printer, layout_um: np.ndarray, settings: ReliefSettings) -> np.ndarray:
+    """Predicted height (y, x), µm, of a layout in heights."""
+    levels = torch.from_numpy(layout_um / np.float32(settings.layout.level_height_um))
+    return by(levels[None, None])[0, 0].numpy()
+
+
+def text_of(record: Mapping[str, Any]) -> str:
+    """A row for each model and layout."""
+    heads = ("predicted by", "layout", "edges, mean", "P95", "area", "missing", "extra", "merged")
+    rows = [
+        (
+            *(row[key] for key in ("model", "layout")),
+            *(f"{row[key]:.2f} nm" for key in ("edge_mean_nm", "edge_p95_nm")),
+            f"{row['area_error_percent']:.2f} %",
+            *(str(row[key]) for key in ("missing", "extra", "merged")),
+        )
+        for row in record["rows"]
+    ]
+    return f"{PICTURE}\n\n{markdown_table(heads, rows)}"
+
+
+def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.ndarray]) -> Figure:
+    """The corrected layout, and the edges of both prints on the film that is wanted."""
+    figure = new_figure(10, 3.6)
+    first, *others = figure.subplots(1, 3)
+    cut = (slice(RIM_PX, -RIM_PX),) * 2
+    first.imshow(layout_um[cut], cmap="Greys_r")
+    first.set_title("corrected layout", fontsize=9)
+    for axes, (kind, height_um) in zip(others, prints.items(), strict=True):
+        axes.imshow(wanted_um[cut], cmap="Greys_r", alpha=0.5)
+        axes.contour(height_um[cut], [wanted_um.max() / 2], colors=["#c23b22"], linewidths=1.3)
+        axes.set_title(f"film wanted, edges of the {kind} print", fontsize=9)
+    for axes in (first, *others):
+        axes.set_axis_off()
+    return figure
+
+
+if __name__ == "__main__":
+    run_script(main)
