@@ -8,7 +8,8 @@ PUBLISH ?=
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 CPUS ?=
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Errors only: setuptools warns of every editable installation.
+INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 # Two test processes on two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal

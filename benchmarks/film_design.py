@@ -39,6 +39,9 @@ PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
 DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
 # Beyond the design nothing is written, which the pattern does not say of its surroundings.
 RIM_PX = 24
+PICTURE = """![Corrected layout; wanted film and edges of both prints](results/second-machine/design.png)
+
+*The corrected layout (grey: part of the dose), and the edges that `blur-table` predicts for both layouts.*"""
 
 
 def main() -> None:
@@ -125,7 +128,7 @@ def text_of(record: Mapping[str, Any]) -> str:
         )
         for row in record["rows"]
     ]
-    return markdown_table(heads, rows)
+    return f"{PICTURE}\n\n{markdown_table(heads, rows)}"
 
 
 def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.ndarray]) -> Figure:

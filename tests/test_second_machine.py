@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from benchmarks import film_design
-from benchmarks.record import published
+from benchmarks import film_design, film_trials
+from benchmarks.record import NOT_MEASURED, published
 from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, judged, made, started, text_of
 from litho_models.models.printers import Printer
 from tests.litho_models.prints import make_scan
@@ -57,6 +59,14 @@ def test_a_print_is_off_by_what_its_edges_are_displaced() -> None:
     assert (layout.pitch_um, layout.cell_um, layout.levels) == (scan.pitch_um, scan.pitch_um, scan.levels)
 
 
-def test_the_page_shows_the_record() -> None:
-    record = json.loads(RESULT.read_text(encoding="utf-8"))
-    assert published(PAGE, "second machine") == text_of(record)
+@pytest.mark.parametrize(
+    ("name", "result", "text"),
+    [
+        ("second machine", RESULT, text_of),
+        ("film design", film_design.RESULT, film_design.text_of),
+        ("film trials", film_trials.RESULT, film_trials.text_of),
+    ],
+)
+def test_the_page_shows_the_record(name: str, result: Path, text: Callable[[Any], str]) -> None:
+    made = text(json.loads(result.read_text(encoding="utf-8"))) if result.is_file() else NOT_MEASURED
+    assert published(PAGE, name) == made
