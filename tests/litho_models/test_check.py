@@ -311,7 +311,7 @@ def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
         ("same", {"false_alarms": 0.0}, "rate of false alarms, got 0.0"),
         ("same", {"tolerance": 5.0}, "0.05 is 5 %"),
         ("pitch", {}, "pitch_um for model affine, got 0.2 µm, wanted 0.1 µm"),
-        ("other", {"reference": "other-too"}, "it is the model of another printer"),
+        ("other", {"reference": "other-too"}, "the model describes another printer"),
     ],
 )
 def test_bad_input_is_one_line(lab, tmp_path, store, given, message):
