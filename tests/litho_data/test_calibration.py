@@ -184,7 +184,7 @@ def test_the_standards_are_in_the_provenance(calibrated: Path) -> None:
         ),
         ("standards/step.txt", "standards/flat.txt", "no edge that stands out"),
         ("standards/step.txt", "standards/none.txt", "no file standards/none.txt"),
-        (f"height_um = {STEP_UM}\nuncertainty", "height_um = 200.0\nuncertainty", "is the unit right"),
+        (f"height_um = {STEP_UM}\nuncertainty", "height_um = 200.0\nuncertainty", "check the unit"),
         ("uncertainty_um = 0.002", "uncertainty_um = -1", "uncertainty_um"),
     ],
 )

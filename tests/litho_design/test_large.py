@@ -218,5 +218,5 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     with pytest.raises(InputError, match="score of a lens in rings, got bands"):
         score(tmp_path, tmp_path / "bands", judges=[printer], band_px=64)
     (tmp_path / RINGS_FILE).write_bytes(b"")
-    with pytest.raises(InputError, match="a file changed after the design"):
+    with pytest.raises(InputError, match="a file that changed after the design"):
         export(tmp_path, "tiff", tmp_path / "again")

@@ -170,7 +170,7 @@ def test_models_frozen_with_the_older_variants_print_as_they_did():
 
 
 def test_weights_of_another_class_or_a_part_are_refused():
-    with pytest.raises(InputError, match="a class of the authors"):
+    with pytest.raises(InputError, match="one of the authors' classes"):
         model_of_authors({"layer.weight": np.zeros(3)})
     physics = {"sigmac_param": 2.5, "thresh": 0.5, "alpha": 5.2514, "kmin": 0.5, "height_bias": -0.1374}
     assert model_of_authors(physics).values["alpha"].item() == pytest.approx(5.2514, rel=1e-6)

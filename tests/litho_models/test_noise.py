@@ -612,7 +612,7 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
     assert chosen.residual_rms_nm > spread.residual_rms_nm
     with pytest.raises(InputError, match="model of"):
         analyse_noise(store, tmp_path / "none", residuals=folder, model="pbl")
-    with pytest.raises(InputError, match="no residuals"):
+    with pytest.raises(InputError, match="without residuals"):
         analyse_noise(store, tmp_path / "none", model="linear")
     other = write_store(tmp_path / "other.zarr", make_scans(3, size_px=64))
     with pytest.raises(InputError, match="dataset of"):
