@@ -17,7 +17,9 @@ def page() -> Page:
     report = Page("Title", words={"share_of": ["share_of a | b", ""]})
     for width in (6.0, 12.0):
         figure = new_figure(width, 3.0)
-        figure.subplots().set_xlabel("x, µm")
+        axes = figure.subplots()
+        axes.plot([0, 1])
+        axes.set(xlabel="x, µm", ylabel="height, µm")
         report.figure(figure, "")
     report.table({"model": ["a_b"], "share_of": [12.345678]}, "50 %", "shares.csv", digits=1)
     return report
