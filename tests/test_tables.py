@@ -18,7 +18,7 @@ from litho_data.layouts.statistics import LayoutStatistics
 from litho_data.layouts.statistics_report import statistics_page
 from litho_data.making import report as of_build
 from litho_data.making.gratings import GratingScan
-from litho_data.making.result import BuildResult, LeftOut
+from litho_data.making.result import BuildResult
 from litho_data.making.suggest import Suggestion
 from litho_data.making.suggest import _write_page as write_suggestion
 from litho_data.making.verdict import Finding
@@ -100,8 +100,8 @@ def of_gratings(folder: Path) -> list[dict[str, Any]]:
 
 def of_a_build(folder: Path) -> list[dict[str, Any]]:
     given: dict[str, Any] = {
-        "skipped": [LeftOut(id="P1", reason="torn")],
-        "unpaired": [LeftOut(id="P2", reason="no scan")],
+        "skipped": {"P1": "torn"},
+        "unpaired": {"P2": "no scan"},
         "findings": [Finding(scan="P3", text="turned", weight=1)],
     }
     quality = {"scan": ["P4", "P5", "P6", "P7"], "warning": ["bent", "", "flat", "bent"]}

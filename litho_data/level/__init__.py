@@ -12,7 +12,7 @@ from litho_data.level.plane import (
 from litho_data.level.polynomial import level_polynomial, level_robust
 from litho_data.level.recipe import Recipe
 from litho_data.level.rows import LevellingWarning, align_rows
-from litho_data.level.scars import mark_scars
+from litho_data.level.scars import mark_scars, remove_scars
 from litho_data.level.selection import Levelled, MaskedLevelling, Masking
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "mark_features",
     "mark_scars",
     "mask_and_relevel",
+    "remove_scars",
     "zero_max",
     "zero_mean",
 ]

@@ -1,6 +1,7 @@
 """Find and remove scars: short strokes along the fast axis where the feedback lost the surface."""
 
-from typing import Annotated, Literal
+from functools import wraps
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -8,6 +9,7 @@ from scipy import ndimage
 
 from litho_data.foundation import Array, InputError
 from litho_data.level.operation import operation
+from litho_data.level.selection import Levelled, as_height, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
 Threshold = Annotated[float, Field(gt=0)]
@@ -54,6 +56,31 @@ def mark_scars(
     return scars & chosen
 
 
+def remove_scars(height: Array, *, scars: Array) -> Levelled:
+    """Replace the marked pixels by the harmonic surface through their surroundings.
+
+    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
+    other pixels stay bit for bit, and ``removed`` is zero there.
+
+    Raises:
+        InputError: marks of another shape, or a marked area without any measured neighbour.
+    """
+    z = as_height(height)
+    if scars.shape != z.shape or scars.dtype != np.bool_:
+        raise InputError("scar mask", got=f"{scars.dtype} {scars.shape}", wanted=f"bool {z.shape}")
+    removed = np.zeros_like(z)
+    unknown = scars & np.isfinite(z)
+    if unknown.any():
+        removed[unknown] = z[unknown] - _harmonic(z, unknown)
+    return subtract(z, removed)
+
+
+@operation("remove-scars")
+@wraps(mark_scars)
+def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
+    return remove_scars(z, scars=mark_scars(z, mask=chosen, masking="include", **how))
+
+
 def _prominence(z: Array, max_width_px: int) -> Array:
     """Return by how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
@@ -77,3 +104,19 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
     kept = reaches & (lengths >= min_length_px)
     kept[0] = False
     return kept[labels]
+
+
+def _harmonic(z: Array, unknown: Array) -> Array:
+    """Values of the unknown pixels, as ``z[unknown]``; the solution covers unmeasured pixels as well."""
+    from SurfaceTopography import Topography
+
+    left_out = unknown | ~np.isfinite(z)
+    areas, _ = ndimage.label(left_out)
+    beside = ndimage.binary_dilation(~left_out)
+    if set(np.unique(areas[unknown])) - set(np.unique(areas[beside & left_out])):
+        raise InputError(
+            "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
+        )
+    known = Topography(np.ma.masked_array(z, left_out), z.shape)
+    filled: Array = known.interpolate_undefined_data_with_harmonic_function().heights()
+    return filled[unknown]

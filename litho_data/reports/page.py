@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from litho_data.foundation import Facts, atomic_file, table_beside
 from litho_data.foundation.run_facts import RunFacts, run_facts
-from litho_data.reports.paper import wanted_format, write_figures
+from litho_data.reports.paper import wanted, write_figures, write_table
 from litho_data.reports.pictures import DARK, LIGHT, model_colour, svg_address
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Page:
         known = tomllib.loads(words.read_text(encoding="utf-8")) if isinstance(words, Path) else words
         self._words: Words = known or {}
         self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
-        self._tables: dict[str, pd.DataFrame] = {}
+        self._tables: list[tuple[str, pd.DataFrame, list[str], int]] = []
         self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
@@ -127,12 +127,12 @@ class Page:
         ]
         meanings = [(column["name"], column["meaning"]) for column in shown if column["meaning"]]
         self._add("table", caption=caption, csv=csv_name, columns=shown, rows=rows, meanings=meanings)
-        self._tables[csv_name] = frame
+        self._tables.append((csv_name, frame, [str(column["name"]) for column in shown], digits))
 
     def figure(self, figure: Figure, caption: str) -> None:
         """Add a matplotlib figure of :func:`new_figure`."""
         self._add("figure", caption=caption, address=svg_address(figure))
-        if wanted_format():
+        if wanted().figures:
             self._figures.append(figure)
 
     def gallery(
@@ -148,11 +148,12 @@ class Page:
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page, its tables and the figures for a paper into ``folder``; return the page's path."""
+        """Write the page, its tables and the copies for a paper into ``folder``; return the page's path."""
         target = Path(folder)
-        for csv_name, frame in self._tables.items():
+        for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
                 frame.to_csv(temporary, index=False)
+            write_table(frame, names, target / csv_name, digits)
         write_figures(self._figures, target)
         run = self._run or RunFacts(**run_facts())
         commit = run.commit + (" with changes" if run.dirty else "")

@@ -1,4 +1,4 @@
-"""Copies of the figures of a report, in the form that a paper needs."""
+"""Copies of the figures and tables of a report, in the form that a paper needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,43 +14,56 @@ from litho_data.commands.app import keyword, option, takes_more
 from litho_data.foundation import atomic_file
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
-Format = Literal["pdf", "svg", "png"]
+Figures = Literal["pdf", "svg", "png"]
+Tables = Literal["csv", "latex", "markdown"]
 
 # Widths of one and of two columns of a two-column page.
 _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
 # A figure that is wider than this on the screen is not legible in one column.
 _WIDE_INCH = 8.0
 _FONT_PT, _DPI = 7.0, 300
-_WANTED: ContextVar[Format | None] = ContextVar("figures for a paper", default=None)
+
+
+@dataclass(frozen=True)
+class PaperCopies:
+    """What is written beside a report: figures in one format, tables in one format besides CSV."""
+
+    figures: Figures | None = None
+    tables: Tables = "csv"
+
+
+_WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=None)
 
 
 @contextmanager
-def paper_copies(figures: Format | None) -> Iterator[None]:
-    """Let reports that are written inside the block also write their figures for a paper."""
-    token = _WANTED.set(figures)
+def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
+    """Reports that are written inside also write their figures and tables for a paper."""
+    token = _WANTED.set(PaperCopies(figures, tables))
     try:
         yield
     finally:
         _WANTED.reset(token)
 
 
-def wanted_format() -> Format | None:
-    """Return the format that the surrounding ``paper_copies`` asks for."""
-    return _WANTED.get()
+def wanted() -> PaperCopies:
+    """The copies requested by the surrounding ``paper_copies``."""
+    return _WANTED.get() or PaperCopies()
 
 
 def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that writes a report the option ``--figures``."""
+    """Give a command that writes a report ``--figures`` and ``--tables``."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
-        with paper_copies(values.pop("figures")):
+        with paper_copies(values.pop("figures"), values.pop("tables")):
             command(**values)
 
-    figures = Annotated[Format | None, option("also write the figures, in the widths of a paper's columns")]
-    return takes_more(run, command, [keyword("figures", figures)])
+    figures = Annotated[Figures | None, option("also write the figures, in the widths of a paper's columns")]
+    tables = Annotated[Tables, option("format of the tables, besides CSV")]
+    return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
@@ -61,7 +75,7 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
     import matplotlib
     from matplotlib.text import Text
 
-    format = wanted_format()
+    ending = wanted().figures
     with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "path"}):
         for number, figure in enumerate(figures, 1):
             width, height = figure.get_size_inches()
@@ -69,5 +83,40 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
             figure.set_size_inches(column, height * column / width)
             for text in figure.findobj(Text):
                 text.set_fontsize(_FONT_PT)
-            with atomic_file(folder / f"figure-{number}.{format}") as temporary:
-                figure.savefig(temporary, format=format, dpi=_DPI)
+            with atomic_file(folder / f"figure-{number}.{ending}") as temporary:
+                figure.savefig(temporary, format=ending, dpi=_DPI)
+
+
+def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
+    """Write a table in the wanted format with ``digits`` places, beside its CSV file with full precision.
+
+    Args:
+        frame: the table; ``names``: what a reader calls its columns.
+        csv_path: its CSV file.
+    """
+    if wanted().tables == "csv":
+        return
+    ending, text_of = _TEXTS[wanted().tables]
+    with atomic_file(csv_path.with_suffix(ending)) as temporary:
+        temporary.write_text(text_of(frame.set_axis(list(names), axis=1), digits), encoding="utf-8")
+
+
+def _latex(frame: pd.DataFrame, digits: int) -> str:
+    return frame.to_latex(index=False, escape=True, float_format=f"%.{digits}f", na_rep="–")
+
+
+def _markdown(frame: pd.DataFrame, digits: int) -> str:
+    def cell(value: object) -> str:
+        if value is None or value != value:
+            return "–"
+        return f"{value:.{digits}f}" if isinstance(value, float) else str(value).replace("|", r"\|")
+
+    rows = [map(cell, frame.columns), ["---"] * len(frame.columns)]
+    rows += [map(cell, row) for row in frame.itertuples(index=False)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+_TEXTS: dict[str, tuple[str, Callable[[pd.DataFrame, int], str]]] = {
+    "latex": (".tex", _latex),
+    "markdown": (".md", _markdown),
+}

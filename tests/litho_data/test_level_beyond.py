@@ -18,6 +18,7 @@ from litho_data.level import (
     mark_features,
     mark_scars,
     mask_and_relevel,
+    remove_scars,
 )
 from litho_data.readers import read_layout, read_scan
 
@@ -188,8 +189,8 @@ def test_planted_tilt_on_a_measured_print_comes_back(measured_prints: Path) -> N
     np.testing.assert_allclose(after - before, tilt - tilt[np.isfinite(level)].mean(), rtol=0, atol=1e-9)
 
 
-def scarred(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A surface with scars, and where they are."""
+def scarred(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A smooth surface, the same with scars, and where they are."""
     y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in SHAPE), indexing="ij")
     smooth = 0.2 * np.sin(x) * np.cos(y)
     scars = np.zeros(SHAPE, dtype=bool)
@@ -198,23 +199,44 @@ def scarred(seed: int) -> tuple[np.ndarray, np.ndarray]:
     spoiled = rough.copy()
     spoiled[30, 20:80] += 0.3
     spoiled[70:73, 50:100] -= 0.3
-    return spoiled, scars
+    return smooth, spoiled, scars
 
 
-def test_scars_are_found() -> None:
-    spoiled, scars = scarred(12)
+def test_scars_are_found_and_filled() -> None:
+    smooth, spoiled, scars = scarred(12)
     single = scars & (np.arange(SHAPE[0]) == 30)[:, None]
-    np.testing.assert_array_equal(mark_scars(spoiled), scars)
+    found = mark_scars(spoiled)
+    np.testing.assert_array_equal(found, scars)
     np.testing.assert_array_equal(mark_scars(spoiled, sign="positive"), single)
-    with pytest.raises(InputError, match="scar parameters"):
-        mark_scars(np.zeros((5, 5)), low=0.7)
+    filled = remove_scars(spoiled, scars=found)
+    np.testing.assert_array_equal(filled.removed[~found], 0.0)
+    # Across three rows the surface bends by less than 0.2 (3/120)² 2² / 2, on top of the noise at both sides.
+    np.testing.assert_allclose(filled.height[scars], smooth[scars], rtol=0, atol=0.0025)
 
 
 def test_scars_shorter_or_wider_than_asked_stay() -> None:
-    spoiled, scars = scarred(13)
+    _, spoiled, scars = scarred(13)
     single = scars & (np.arange(SHAPE[0]) == 30)[:, None]
     assert not mark_scars(spoiled, min_length_px=61).any()
     np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=2), single)
     np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=3), scars)
     np.testing.assert_array_equal(mark_scars(spoiled, max_width_px=1), single)
     assert not mark_scars(np.zeros(SHAPE)).any()
+
+
+def test_filling_is_harmonic() -> None:
+    """A linear surface solves Laplace's equation, so it comes back whatever stood under the marks."""
+    z = 0.1 * np.arange(30)[:, None] + 0.2 * np.arange(40)[None, :]
+    marks = np.zeros(z.shape, dtype=bool)
+    marks[5:12, 6:30] = marks[20, 20] = True
+    filled = remove_scars(np.where(marks, 99.0, z), scars=marks)
+    np.testing.assert_allclose(filled.height, z, rtol=0, atol=1e-12)
+
+
+def test_filling_without_surroundings_is_refused() -> None:
+    with pytest.raises(InputError, match="no measured neighbour"):
+        remove_scars(np.zeros((5, 5)), scars=np.ones((5, 5), dtype=bool))
+    with pytest.raises(InputError, match="scar mask"):
+        remove_scars(np.zeros((5, 5)), scars=np.ones((5, 4), dtype=bool))
+    with pytest.raises(InputError, match="scar parameters"):
+        mark_scars(np.zeros((5, 5)), low=0.7)

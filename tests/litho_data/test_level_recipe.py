@@ -95,7 +95,7 @@ def test_the_canonical_form_is_complete_and_reads_back(tmp_path: Path) -> None:
 
 
 def test_every_operation_runs_with_its_defaults() -> None:
-    assert len(STEPS) == 12
+    assert len(STEPS) == 13
     layout = np.random.default_rng(1).integers(0, 5, size=(40, 50)).astype(float)
     for op, model in STEPS.items():
         levelled = Recipe(step=(model(op=op),)).apply(surface(), pitch_um=(1.0, 1.0), layout_level=layout)
