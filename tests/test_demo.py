@@ -24,7 +24,7 @@ RESULTS = ROOT / "docs" / "results" / "neural-lithography"
 
 @pytest.mark.pictures
 def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
-    knobs = ["elliptical-psf=0.3", "write-order-memory=0.15"]
+    knobs = ["slope-thinning-x=0.3", "write-order-memory=0.15"]
     litho_data.simulate(tmp_path / "fab", count=1, size_px=64, knobs=knobs)
     write_store(tmp_path / "store.zarr", make_scans(2, 32))
     for name, result in (("close-loop", "causes/close_loop.json"), ("benchmark", "benchmark.json")):
@@ -48,7 +48,7 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     text = page.write(tmp_path, "index.html").read_text("utf-8")
     assert re.findall(r"<h2[^>]*>\s*(\d)\. ", text) == list("123456")
     assert text.count("<figure") == 6
-    # elliptical-psf is among the effects found on the measured prints, whose result stands in here.
+    # slope-thinning is among the effects found on the measured prints, whose result stands in here.
     assert "2 effects were hidden in the prints, and the loop found 1 of them" in answer
     assert answer in text
     assert "Planted and not found: write-order-memory" in text

@@ -193,7 +193,7 @@ def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch
         Element(printer, LAYOUT, kind="thick", surroundings=1.33)
     with pytest.raises(InputError, match="resin"):
         Element(printer, LAYOUT, resin="constant").optics(0.5)
-    with pytest.raises(InputError, match="thin one"):
+    with pytest.raises(InputError, match="a thin element"):
         Element(printer, LAYOUT, kind="thick").as_torchoptics()
     printer.simulator.card = {"process_effects": {"edge-bead": {}}}
     with pytest.raises(InputError, match="one piece"):

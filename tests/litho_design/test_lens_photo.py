@@ -204,8 +204,8 @@ def test_the_command_tells_the_errors(tmp_path, lens, picture, monkeypatch, caps
     assert stop.value.code == 0
     score = ScoreResult.read(tmp_path / "score").scores[0]
     told = ", ".join(
-        f"MAE {name} {score.figures[f'mae_{name}']:.4f} ± {score.uncertainty[f'mae_{name}']:.4f}"
-        for name in ("direct", "design")
+        f"MAE {score.figures[f'mae_{name}']:.4f} ± {score.uncertainty[f'mae_{name}']:.4f} {where}"
+        for name, where in (("direct", "on the sensor"), ("design", "with the designed PSF"))
     )
     assert f"camera photo.png: {told}" in capsys.readouterr().out
     table = (tmp_path / "score" / "scores.csv").read_text()

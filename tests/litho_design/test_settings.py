@@ -220,7 +220,7 @@ def test_python_takes_the_same_changes():
         (("hoe", "--config", "nowhere.toml"), "nowhere.toml"),
         (("hoe", "--config", "settings.yaml"), ".toml or .json"),
         (("lens", "--set", "imaging.objects=[]"), "are needed"),
-        (("compare", "--models", "none", "--window-px", "64"), "--window-px, got the hoe task"),
+        (("compare", "--models", "none", "--window-px", "64"), "--window-px, got an option of the hoe task"),
         (("compare", "--models", "none", "--task", "lens-direct", "--loss-scale", "paper"), "--loss-scale"),
         (("compare", "--models", "none", "--set", "search.seed=4"), "search.seed"),
     ],

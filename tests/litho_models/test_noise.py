@@ -630,7 +630,7 @@ def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
     # What is left of scans that a model was fitted to is no estimate of the noise.
     assert (result.budget, result.noise_floor.kind) == (None, "unknown")
     assert len(spread.calibrations[0].scans) == 7
-    with pytest.raises(InputError, match="a frozen one"):
+    with pytest.raises(InputError, match="with a frozen model"):
         analyse_noise(store, tmp_path / "none", residuals=tmp_path / "run" / "model", model="linear")
 
 
@@ -705,7 +705,7 @@ def test_the_command_takes_single_files(tmp_path):
         (["STORE", "--substrate", "F", "--steps", "F"], "got a store and --substrate, --steps"),
         (["STORE", "--level-height-um", "0.2"], "got a store and --level-height-um"),
         (["--flat", "F", "--residuals", "B", "--model", "M"], "got --flat and --residuals, --model"),
-        (["--flat", "F", "--level-height-um", "0.2"], "got --level-height-um, wanted --steps"),
+        (["--flat", "F", "--level-height-um", "0.2"], "got --level-height-um without --steps"),
     ],
 )
 def test_the_command_refuses_options_that_it_would_not_use(tmp_path, given, said):

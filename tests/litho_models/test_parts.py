@@ -311,7 +311,7 @@ def test_numbers_of_a_model_are_set_and_fixed_on_the_command_line(
 
 @pytest.mark.parametrize("name", [name for name, one in MODELS.items() if issubclass(one, Printer)])
 def test_a_preset_is_built_for_its_own_pitch_and_says_what_it_does_not_know(name: str) -> None:
-    with pytest.raises(InputError, match="no number"):
+    with pytest.raises(InputError, match="not a number of these parts"):
         printer(name, **{"spot.width_um": 1.0})
     with pytest.raises(InputError, match="part of a printer"):
         build_model(name, parts=("lamp",))
