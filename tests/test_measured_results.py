@@ -57,6 +57,7 @@ def test_the_page_on_the_store_quotes_the_uncertainty_of_the_measured_heights():
     assert f"the median of `sigma_nm` is {middle('sigma_nm')} nm" in page
     assert (
         f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}; {unclear} of the {len(scans)} scans show no "
-        f"clear surface). Pixels and lines ({middle('sigma_pixel_nm')}, {middle('sigma_line_nm')}), resampling "
-        f"({middle('sigma_resampling_nm')}) and registration ({middle('sigma_registration_nm')})"
+        f"clear surface). Pixels and lines ({middle('sigma_pixel_nm')}, {middle('sigma_line_nm')}), "
+        f"resampling ({middle('sigma_resampling_nm')}) and registration "
+        f"({middle('sigma_registration_nm')})"
     ) in page
