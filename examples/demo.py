@@ -112,7 +112,8 @@ def plan(out: Path, dataset: str) -> list[Step]:
             _data("simulate", "--preset", "demo", "--out", card.parents[1]),
             card,
         )
-        anew = []
+        # The fab contains Physics, and one base keeps the demo below five minutes.
+        anew = ["--base", "physics"]
     training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
         source,
