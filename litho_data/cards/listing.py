@@ -16,7 +16,7 @@ from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, rea
 from litho_data.foundation import Facts, InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
-# Longest time that a card's expression may take to match, in a separate process.
+# A separate process matches a card's regular expression against file names; it is stopped after this time.
 _LONGEST_S = 10.0
 _MATCH = """
 import json, re, sys

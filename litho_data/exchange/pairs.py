@@ -177,7 +177,7 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; return a note for everything that a scan lost.
+    """Write a store in the pair format; return a note for each loss of negative heights or gaps.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 

@@ -94,7 +94,7 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 
 
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
-    """Combine several scans of one tip: return the mean of the estimates, or the lowest bound.
+    """Combine scans of one tip: return the mean estimate, or the lowest bound if there is no estimate.
 
     Estimates well above the lowest come from rounded surfaces and are dropped. A bound from one scan refutes
     estimates well above it from others.

@@ -132,8 +132,12 @@ def _at_place() -> Iterator[Facts]:
     yield from (_blurred_at(word) for word in _WORDS)
 
 
-def _steepness() -> Iterator[Facts]:
-    yield "steepness-power", "|∇h|^power", "1", lambda s: s.size("x", "y", power=s.values["power"])
+_STEEPNESS: Facts = (
+    "steepness-power",
+    "|∇h|^power",
+    "1",
+    lambda s: s.size("x", "y", power=s.values["power"]),
+)
 
 
 def _nearby() -> Iterator[Facts]:
@@ -190,14 +194,12 @@ def _beside(name: str, *sides: str) -> Facts:
     return name, formula, "µm", lambda s: s.trailing(*sides) - s.h
 
 
-def _crowding() -> Iterator[Facts]:
-    formula = "D (mean of D within the length / full height)^power"
-    yield (
-        "dose-times-density",
-        formula,
-        "µm",
-        lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
-    )
+_CROWDING: Facts = (
+    "dose-times-density",
+    "D (mean of D within the length / full height)^power",
+    "µm",
+    lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
+)
 
 
 def _law(
@@ -288,7 +290,7 @@ def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
 
 _OF_HEIGHT: Families = (
     (_fixed(), {}),
-    (_steepness(), _POWER),
+    ([_STEEPNESS], _POWER),
     (map(_power, "xy"), {**_POWER, **_TURN}),
     ((*_one_way("x"), *_one_way("y")), _TURN),
     (_nearby(), _REACH),
@@ -301,7 +303,7 @@ _OF_DOSE: Families = (
         {**_TAIL, **_TURN},
     ),
     ((_beside(f"dose-from-{side}", side) for side in _SIDES), {**_TAIL, **_TURN}),
-    (_crowding(), {**_REACH, **_POWER}),
+    ([_CROWDING], {**_REACH, **_POWER}),
 )
 _FOUND = [
     *(_law(*facts, shapes, "height") for family, shapes in _OF_HEIGHT for facts in family),

@@ -66,7 +66,7 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Subtract from each scan what the scans of its group share."""
+        """Return the scans freed of what the scans of a group share."""
         return self.base.study
 
     @property
@@ -161,7 +161,8 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose a base model among those that do as well as the best.
 
-    The chosen base finds causes that the others also find, with the fewest parameters.
+    The choice is the base with the fewest causes that are not found with every other base, and among equals
+    the one with the fewest parameters.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {

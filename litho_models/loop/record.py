@@ -187,7 +187,7 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """Compare two answers on new prints: by how much the first fits better, in nm² and in standard
+    """Two answers compared on new prints: by how much the first fits better, in nm² and in standard
     deviations.
 
     ``z`` allows for an error in the model's form; ``difference_nm`` is the rms difference of the two

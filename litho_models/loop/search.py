@@ -22,7 +22,7 @@ from litho_models.loop.screening import Screened, Screening, best_grouping
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Labels
 
-# Two effects count as indistinguishable from this correlation of their changes on.
+# Two effects whose changes correlate at least this much count as indistinguishable.
 SAME_COSINE = 0.8
 
 

@@ -32,7 +32,7 @@ _TILE_PX = 64
 
 
 class NoiseSpectrum(Record):
-    """The mean power of tiles of residuals, nm² per pixel of noise variance.
+    """The power spectrum of the noise, nm²: the mean over tiles of residuals.
 
     ``power_nm2`` has shape (n, n), at the frequencies of ``np.fft.fft2`` of a tile; its mean is the variance
     of a pixel.
