@@ -130,7 +130,11 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     # Slopes of the pieces to the right of each pixel, then to the right of each middle.
     slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
     steepest = max(float(s.detach().abs().max()) for s in slopes)
-    reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
+    # The tip touches nothing farther away than R s, or where its parabola is below the lowest height.
+    tops_um = torch.stack([height, middles]).detach()
+    deepest_um = math.sqrt(2 * float(radius_um.detach() * (tops_um.max() - tops_um.min())))
+    farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
+    reach_px = min(math.ceil(farthest_um / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
     rises = [_continued(part, reach_px, "constant") for part in slopes]
     # The gradient of a maximum is that of the touched piece. The search needs no gradient, which would keep

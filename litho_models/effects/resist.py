@@ -163,8 +163,18 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
     """Return the largest value in the square around each pixel whose square lies inside, computed axis by
     axis.
     """
-    size = 2 * half_px + 1
-    return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
+    return _running_maximum(_running_maximum(field, half_px, -2), half_px, -1)
+
+
+def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
+    """Return the maximum over 2 half_px + 1 neighbours along an axis; each step doubles the width."""
+    size, width = 2 * half_px + 1, 1
+    while width < size:
+        shift = min(width, size - width)
+        left = field.shape[axis] - shift
+        field = torch.maximum(field.narrow(axis, 0, left), field.narrow(axis, shift, left))
+        width += shift
+    return field
 
 
 @of_development(
