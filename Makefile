@@ -73,7 +73,7 @@ format: $(STAMP)   ## bring the code into the common style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-release: check test ## build, try the wheel in empty environments, tag the version
+release: $(STAMP)  ## check, test, build, try the wheel in empty environments, tag the version
 	.ci/release
 
 clean:             ## remove the environment and the caches, keep results

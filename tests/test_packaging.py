@@ -118,7 +118,7 @@ mkdir -p "$3/bin"
 for name in pip litho-data litho-design; do
   cat >"$3/bin/$name" <<END
 #!/bin/sh
-echo "$name in \\$(basename "\\$PWD"): \\$*" >>"$LOG"
+echo "$name in \\$(basename "\\$PWD") of \\$(basename "\\$HOME")\\$PYTHONPATH: \\$*" >>"$LOG"
 [ $name != {broken} ]
 END
   chmod +x "$3/bin/$name"
@@ -126,14 +126,28 @@ done
 """
 
 
+CHECKS = """#!/bin/sh
+echo "make: $*" | tee -a "$LOG"
+exit {code}
+"""
+
+
 def released(
-    folder: Path, *, said: str = TODAY, tag: str = "", change: str = "", **of_312: object
+    folder: Path,
+    *,
+    said: str = TODAY,
+    cited: str = "9.8.7",
+    tag: str = "",
+    change: str = "",
+    checks: int = 0,
+    **of_312: object,
 ) -> tuple[int, str]:
     """Exit code and last line of the release of a small project in ``folder``."""
     files = {
         ".venv/bin/python": BUILDS,
-        ".gitignore": ".venv/\nbin/\ndist/\nlog\n",
-        "CITATION.cff": f"date-released: {said}\n",
+        ".gitignore": ".venv/\nbin/\ndist/\nlog\ntmp/\n",
+        "bin/make": CHECKS.format(code=checks),
+        "CITATION.cff": f"version: {cited}\ndate-released: {said}\n",
         "CHANGELOG.md": f"## 9.8.7 ({said})\n",
     }
     for python in ("python3.11", "python3.12", "python3.13"):
@@ -144,10 +158,12 @@ def released(
         (folder / name).write_text(text, "utf-8")
         (folder / name).chmod(0o755)
     (folder / ".ci").mkdir()
+    (folder / "tmp").mkdir()
     shutil.copy(ROOT / ".ci" / "release", folder / ".ci")
     names = {f"GIT_{role}_{what}": "a@b" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
     path = f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
-    environment = os.environ | names | {"PATH": path, "LOG": str(folder / "log")}
+    places = {"LOG": str(folder / "log"), "HOME": str(folder), "TMPDIR": str(folder / "tmp")}
+    environment = os.environ | names | places | {"PATH": path, "PYTHONPATH": "/of/the/checkout"}
     tagging = [["tag", tag]] if tag else []
     for words in (["init", "--quiet"], ["add", "."], ["commit", "--quiet", "--message", "all"], *tagging):
         subprocess.run(["git", *words], cwd=folder, env=environment, check=True)
@@ -166,10 +182,12 @@ def tags(folder: Path) -> list[str]:
 def test_a_release_tries_its_wheel_with_every_python_before_it_is_tagged(tmp_path: Path) -> None:
     assert released(tmp_path) == (0, "v9.8.7 is tagged; push the tag to publish it")
     assert tags(tmp_path) == ["v9.8.7"]
-    tried = (tmp_path / "log").read_text("utf-8").splitlines()
+    checked, *tried = (tmp_path / "log").read_text("utf-8").splitlines()
+    assert checked == "make: check test"
     assert [line.split(":")[0].split()[0] for line in tried] == 3 * ["pip", "litho-data", "litho-design"]
     assert all("dist/litholoop-9.8.7-py3-none-any.whl[design]" in line for line in tried[::3])
-    assert tried[2::3] == 3 * ["litho-design in empty: first --out first"]
+    assert tried[2::3] == 3 * ["litho-design in empty of empty: first --out first"]
+    assert list((tmp_path / "tmp").iterdir()) == []
     supported = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
     named = " ".join(f"python{one}" for one in supported)
     assert f"pythons=({named})" in (ROOT / ".ci" / "release").read_text("utf-8")
@@ -182,7 +200,9 @@ def test_a_release_tries_its_wheel_with_every_python_before_it_is_tagged(tmp_pat
         ({"change": "new.py"}, "not committed"),
         ({"tag": "v9.8.7"}, "tagged already"),
         ({"said": "2020-02-02"}, "into CITATION.cff"),
+        ({"cited": "9.8.6"}, "into CITATION.cff"),
         ({"known": 127}, "python3.12 does not run"),
+        ({"checks": 1}, ""),
         ({"broken": "litho-design"}, ""),
         ({"broken": "pip"}, ""),
     ],
@@ -193,3 +213,6 @@ def test_a_release_that_is_not_ready_is_not_tagged(tmp_path: Path, fault: dict, 
     assert code != 0
     assert said in line
     assert tags(tmp_path) == ([fault["tag"]] if "tag" in fault else [])
+    # What can be refused is refused before the tests, which take minutes; no trial is left behind.
+    assert (tmp_path / "log").exists() == (not said)
+    assert list((tmp_path / "tmp").iterdir()) == []
