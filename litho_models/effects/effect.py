@@ -54,6 +54,11 @@ class Parameter:
         """Return the value this parameter has while its effect is off."""
         return self.null if self.kind == "amplitude" else self.typical
 
+    @property
+    def is_length(self) -> bool:
+        """Return whether the unit is one of length."""
+        return self.unit in ("µm", "px")
+
 
 @dataclass(frozen=True)
 class FieldContext:

@@ -71,6 +71,8 @@ class Check:
             reason = f"may only correct the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
             reason = f"beside {', '.join(self.laws_in)} it gains less than half of what it gains without them"
+        elif outgrown := self.state.twin.outgrows(cause.name):
+            reason = f"its best length is outside the range of this effect: {', '.join(outgrown)}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
             reason = f"its best strength is beyond the largest possible one: {', '.join(exhausted)}"
         # If a small part of the causes is still missing, any columns explain some of it, so a small gain

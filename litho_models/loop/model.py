@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -276,9 +276,15 @@ class Twin:
         """Name the amplitudes of an effect that lie on a limit of their range, other than the null, in some
         group.
         """
+        return self._at_limits(name, lambda one, at: one.kind == "amplitude" and at != one.null)
+
+    def outgrows(self, name: str) -> list[str]:
+        """Name the fitted lengths, such as ranges and depths, of an effect that lie on a limit."""
+        return self._at_limits(name, lambda one, at: one.kind == "shape" and one.is_length)
+
+    def _at_limits(self, name: str, counts: Callable[[Parameter, float], bool]) -> list[str]:
         own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
-        beyond = (slot for slot, at in own if slot.facts.kind == "amplitude" and at != slot.facts.null)
-        return [*dict.fromkeys(slot.parameter for slot in beyond)]
+        return [*dict.fromkeys(slot.parameter for slot, bound in own if counts(slot.facts, bound))]
 
     def _on_bounds(self) -> list[tuple[Slot, float]]:
         return [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -71,20 +72,27 @@ def squared(squares_nm2: float) -> dict[str, object]:
     }
 
 
+def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -> SimpleNamespace:
+    """A fitted model of which these parameters lie on a limit."""
+    return SimpleNamespace(exhausts=lambda name: exhausts, outgrows=lambda name: outgrows, slots=())
+
+
 @pytest.mark.parametrize(
-    ("reshaped_nm2", "left_nm2", "exhausted", "said"),
+    ("reshaped_nm2", "left_nm2", "limits", "said"),
     [
-        (1.4, 0.0, [], ""),  # 14 % of its gain in other shapes
-        (1.6, 5.0, [], "gain another 16 %"),
-        (1.6, 5.4, [], ""),  # more than twice as much again is left for causes that are missing
-        (1.6, 5.4, ["fraction"], "beyond the largest possible one: fraction"),
-        (1.4, 0.0, ["fraction"], ""),
+        (1.4, 0.0, {}, ""),  # 14 % of its gain in other shapes
+        (1.6, 5.0, {}, "gain another 16 %"),
+        (1.6, 5.4, {}, ""),  # more than twice as much again is left for causes that are missing
+        (1.6, 5.4, {"exhausts": ["fraction"]}, "beyond the largest possible one: fraction"),
+        (1.4, 0.0, {"exhausts": ["fraction"]}, ""),
+        # A range at its limit is another effect, however well the form fits.
+        (0.0, 0.0, {"outgrows": ["length_px"]}, "outside the range of this effect: length_px"),
     ],
 )
 def test_the_limits_of_a_name_are_those_that_are_written(
     reshaped_nm2: float,
     left_nm2: float,
-    exhausted: list[str],
+    limits: dict[str, list[str]],
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -92,7 +100,7 @@ def test_the_limits_of_a_name_are_those_that_are_written(
     cause = Cause("slope-thinning", ALL, (), judge(np.full(10, 100.0), np.full(10, 90.0), study), 0.01, None)
     state = SimpleNamespace(
         **squared(90),
-        twin=SimpleNamespace(exhausts=lambda name: exhausted, slots=()),
+        twin=twin_at_limits(**limits),
         without=lambda name: leaving(100),
         study=study,
     )
@@ -115,7 +123,7 @@ def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
     """A model that leaves so much in each of ten scans, and without any of its effects so much."""
     return SimpleNamespace(
         **squared(squares_nm2),
-        twin=SimpleNamespace(exhausts=lambda name: [], slots=()),
+        twin=twin_at_limits(),
         without=lambda name: leaving(without_nm2),
         study=STUDY,
     )

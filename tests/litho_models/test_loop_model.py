@@ -163,6 +163,18 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert ends.exhausts(THINNING) == ["along_x_um"]
     vector[3] = facts["along_x_um"].upper
     assert twin.at(vector).exhausts(THINNING) == ["along_x_um"]
+    # The exponent is no length.
+    vector[-1] = facts["exponent"].upper
+    assert twin.at(vector).outgrows(THINNING) == []
+
+
+@pytest.mark.parametrize(("length_px", "outgrown"), [(8.0, ["length_px"]), (9.0, []), (280.0, ["length_px"])])
+def test_a_range_at_its_limit_outgrows_its_effect(length_px: float, outgrown: list[str]) -> None:
+    name = "electron-backscatter"
+    values = get_effect(name).with_values({"length_px": length_px})
+    beam = Twin.bare(base_model()).with_effect(name, ALL, {"": values})
+    assert beam.outgrows(name) == outgrown
+    assert beam.outgrows(THINNING) == []
 
 
 def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
