@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from typing import Literal
 
 from torch import Tensor, nn
@@ -13,6 +13,9 @@ from litho_models.simulator import Simulator, Tile
 
 # Whether an effect turns with the print or with the scan.
 Frame = Literal["scan", "print"]
+# What a field depends on: the effects before it, with their values, and the base.
+Key = tuple[object, ...]
+Fields = MutableMapping[Key, Tensor]
 
 
 class EffectChain(nn.Module):
@@ -51,21 +54,36 @@ class EffectChain(nn.Module):
             context = FieldContext(
                 layout_um, geometry.pitch_um, geometry.full_height_um, geometry.level_height_um
             )
-        return self.after_base(self.base(self.before_base(layout_um, context)), context)
+        return self.after_base(self.base(self.before_base(layout_um, context)[0]), context)
 
-    def before_base(self, layout_um: Tensor, context: FieldContext) -> Tensor:
-        """Apply the effects that act before the base model to the layout."""
-        return self._run_stage("layout", layout_um, context)
+    def before_base(
+        self, layout_um: Tensor, context: FieldContext, known: Fields | None = None
+    ) -> tuple[Tensor, Key]:
+        """Apply the effects that act before the base model to the layout; see ``after_base``."""
+        return self._run_stage("layout", layout_um, context, {} if known is None else known, ())
 
-    def after_base(self, height_um: Tensor, context: FieldContext) -> Tensor:
-        """Apply the height effects to the base model's height."""
-        return self._run_stage("height", height_um, context)
+    def after_base(
+        self, height_um: Tensor, context: FieldContext, known: Fields | None = None, key: Key = ()
+    ) -> Tensor:
+        """Apply the height effects to the base model's height.
 
-    def _run_stage(self, acts_on: ActsOn, field: Tensor, context: FieldContext) -> Tensor:
+        Args:
+            known: the fields after each effect that were computed before, for the same scan and base; new
+                ones are added.
+            key: what ``height_um`` depends on.
+        """
+        return self._run_stage("height", height_um, context, {} if known is None else known, key)[0]
+
+    def _run_stage(
+        self, acts_on: ActsOn, field: Tensor, context: FieldContext, known: Fields, key: Key
+    ) -> tuple[Tensor, Key]:
         for name, values in self.values.items():
             effect = get_effect(name)
             if effect.acts_on == acts_on:
-                usual = "scan" if effect.stage == "measurement" else "print"
-                scanned = self.frames.get(name, usual) == "scan"
-                field = effect(field, values, context, scanned=scanned)
-        return field
+                key = (*key, name, *values.values())
+                if key not in known:
+                    usual = "scan" if effect.stage == "measurement" else "print"
+                    scanned = self.frames.get(name, usual) == "scan"
+                    known[key] = effect(field, values, context, scanned=scanned)
+                field = known[key]
+        return field, key

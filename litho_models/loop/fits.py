@@ -5,6 +5,7 @@ Per-scan terms are projected out, so they do not bias the parameters of the prin
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
-from litho_models.effects import get_effect
+from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import (
     Linearised,
     Rules,
@@ -174,19 +175,15 @@ class TwinProblem:
     def _of_window(
         self, twin: Twin, moved: Sequence[Twin], steps: np.ndarray, window: PreparedScan
     ) -> Linearised:
-        layout = twin.exposed(window)
-        base = twin.base_height(layout, window)
-        prediction = twin.height(window, base_um=base)
+        fields: Fields = {}
+        prediction = twin.height(window, known=fields)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
-            if slot is not None and not twin.is_of(slot, window):
-                continue
-            # Only the steps of the chain before the changed parameter can be reused.
-            known = other.base_height(layout, window) if slot is None else None
-            if slot is not None and get_effect(slot.effect).acts_on == "height":
-                known = base
-            rows[at] = (window.at_sample(other.height(window, base_um=known)) - value) / steps[at]
+            if slot is None or twin.is_of(slot, window):
+                # Only the effects from the changed one on are computed again.
+                there = other.height(window, known=ChainMap({}, fields))
+                rows[at] = (window.at_sample(there) - value) / steps[at]
         return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:

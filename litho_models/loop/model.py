@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.utils import vector_to_parameters
 
 from litho_models.effects import Parameter, get_effect
-from litho_models.effects.chain import EffectChain, Frame
+from litho_models.effects.chain import EffectChain, Fields, Frame
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
@@ -209,29 +209,22 @@ class Twin:
         return self._chains[key]
 
     @torch.no_grad()
-    def exposed(self, scan: PreparedScan) -> Tensor:
-        """Return the layout (1, 1, y, x), µm, after the effects that act on it."""
-        return self.chain(scan).before_base(scan.context.layout_um, scan.context)
-
-    @torch.no_grad()
-    def base_height(self, exposed_um: Tensor, scan: PreparedScan) -> Tensor:
-        """Return the height (1, 1, y, x), µm, that the base alone predicts for an exposed layout (1, 1, y,
-        x), µm.
-        """
-        base = self.fitted_base
-        return (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
-
-    @torch.no_grad()
     def height(
-        self, scan: PreparedScan, extra: Values | None = None, base_um: Tensor | None = None
+        self, scan: PreparedScan, extra: Values | None = None, known: Fields | None = None
     ) -> np.ndarray:
-        """Return the predicted height of the print (y, x), µm; ``base_um`` is the base's prediction, if
-        known.
+        """Return the predicted height of the print (y, x), µm.
+
+        Args:
+            extra: a further effect to try.
+            known: fields of this scan that twins of the same base computed before; new ones are added.
         """
-        chain = self.chain(scan, extra)
-        if base_um is None:
-            base_um = self.base_height(chain.before_base(scan.context.layout_um, scan.context), scan)
-        return chain.after_base(base_um, scan.context)[0, 0].numpy()
+        chain, known = self.chain(scan, extra), {} if known is None else known
+        exposed_um, key = chain.before_base(scan.context.layout_um, scan.context, known)
+        key = (*key, self.numbers.tobytes())
+        if key not in known:
+            base = self.fitted_base
+            known[key] = (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
+        return chain.after_base(known[key], scan.context, known, key)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
         """Return the steps (p,) of difference quotients, which go upwards except at an upper limit."""

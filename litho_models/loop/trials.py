@@ -4,7 +4,7 @@ scans.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from litho_models.effects import Effect
+from litho_models.effects.chain import Fields
 from litho_models.loop.fits import ALL_FREE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
@@ -107,9 +108,10 @@ class Secants:
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin, self._windows = twin, windows
-        self._bases_um = [twin.base_height(twin.exposed(one), one) for one in windows]
-        pairs = zip(windows, self._bases_um, strict=True)
-        self._heights_um = [twin.height(one, base_um=base) for one, base in pairs]
+        self._fields: list[Fields] = [{} for _ in windows]
+        self._heights_um = [
+            twin.height(one, known=known) for one, known in zip(windows, self._fields, strict=True)
+        ]
         heights = zip(windows, self._heights_um, strict=True)
         self.free_terms = [one.free_basis(height, ALL_FREE) for one, height in heights]
         self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
@@ -126,7 +128,7 @@ class Secants:
 
     def _changes(self, effect: Effect, values: Mapping[str, float]) -> list[NDArray[np.float32]]:
         extra, found = {effect.name: effect.with_values(values)}, []
-        for window, base, here in zip(self._windows, self._bases_um, self._heights_um, strict=True):
-            moved = self._twin.height(window, extra, base if effect.acts_on == "height" else None)
+        for window, known, here in zip(self._windows, self._fields, self._heights_um, strict=True):
+            moved = self._twin.height(window, extra, ChainMap({}, known))
             found.append(window.at_sample(moved - here).astype(np.float32))
         return found
